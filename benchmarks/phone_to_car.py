@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from advnerf_core.data.keyframes import KeyframeConfig
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.view_loading import load_image
 from advnerf_core.policies.network import images_to_tensor
@@ -92,7 +91,7 @@ def make_scene(folder: Path, frames: int, steps: int) -> tuple[Path, str]:
         [phone],
         bag,
         data,
-        MediaConfig(KeyframeConfig()),
+        MediaConfig(),
         BagConfig(0.15, math.radians(8.0)),
         SfmConfig(),
         0.08,

@@ -18,32 +18,14 @@ from advnerf_core.data.image_files import Grey, Rgb
 _WORK_WIDTH = 480
 _CORNERS, _LEAST_CORNERS = 300, 12
 _LOST_SHARE, _RETURN_PX = 0.35, 1.0
-
-
-@dataclass(frozen=True)
-class KeyframeConfig:
-    """Criteria for selecting frames.
-
-    Attributes:
-        movement: Displacement of the picture after which a new frame is due, as a share of its width.
-        window: Share of that movement over which the sharpest frame is looked for.
-        blur_limit: A frame less sharp than this share of the usual sharpness is passed over until `max_wait_s` is over.
-        max_wait_s: Longest time until another frame is kept, if the view has moved at all [s].
-    """
-
-    movement: float = 0.06
-    window: float = 0.4
-    blur_limit: float = 0.35
-    max_wait_s: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not (
-            0.0 < self.movement < 1.0
-            and 0.0 < self.window < 1.0
-            and 0.0 <= self.blur_limit < 1.0
-            and self.max_wait_s > 0.0
-        ):
-            raise ValueError(f"expected shares between 0 and 1 and a positive time, got {self}")
+# Displacement of the picture after which a new frame is due, as a share of its width.
+MOVEMENT = 0.06
+# Share of that movement over which the sharpest frame is looked for.
+WINDOW = 0.4
+# A frame less sharp than this share of the usual sharpness is passed over until the longest wait is over.
+BLUR_LIMIT = 0.35
+# Longest time until another frame is kept, if the view has moved at all [s].
+MAX_WAIT_S = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +46,14 @@ class Candidate:
 
 
 class KeyframeSelector:
-    """Takes frames one after another and selects those to keep; holds at most two of them."""
+    """Takes frames one after another and selects those to keep; holds at most two of them.
 
-    def __init__(self, config: KeyframeConfig | None = None) -> None:
-        self._config = config or KeyframeConfig()
+    Args:
+        movement: Displacement of the picture after which a new frame is due, as a share of its width.
+    """
+
+    def __init__(self, movement: float = MOVEMENT) -> None:
+        self._due = movement
         self._kept: Grey | None = None
         self._kept_s = 0.0
         self._corners: NDArray[np.float32] = np.zeros((0, 1, 2), np.float32)
@@ -84,14 +70,16 @@ class KeyframeSelector:
             self._best = new
             self._remember(new)
             return None
-        config, waited = self._config, time_s - self._kept_s
-        if new.sharpness < config.blur_limit * self._usual and waited < config.max_wait_s:
+        waited = time_s - self._kept_s
+        if new.sharpness < BLUR_LIMIT * self._usual and waited < MAX_WAIT_S:
             return None  # and corners cannot be followed into it either
         moved = self.movement(grey)
-        late = waited >= config.max_wait_s and moved >= 0.1 * config.movement
-        if moved >= (1.0 - config.window) * config.movement or late:
-            self._best = _sharper(self._best, new)
-        return self._keep() if moved >= config.movement or late else None
+        late = waited >= MAX_WAIT_S and moved >= 0.1 * self._due
+        if (moved >= (1.0 - WINDOW) * self._due or late) and (
+            self._best is None or new.sharpness > self._best.sharpness
+        ):
+            self._best = new
+        return self._keep() if moved >= self._due or late else None
 
     def last(self) -> Candidate | None:
         """At the end of the video: the best frame that has moved on and was not kept, if any."""
@@ -146,7 +134,3 @@ def _follow(
 def sharpness(grey: Grey) -> float:
     """Variance of the Laplacian of an image ``[h, w]``."""
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
-
-
-def _sharper(best: Candidate | None, new: Candidate) -> Candidate:
-    return new if best is None or new.sharpness > best.sharpness else best

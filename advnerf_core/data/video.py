@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import Rgb, write_image
-from advnerf_core.data.keyframes import Candidate, KeyframeConfig, KeyframeSelector
+from advnerf_core.data.keyframes import BLUR_LIMIT, MAX_WAIT_S, WINDOW, Candidate, KeyframeSelector
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_json
 
@@ -72,25 +71,26 @@ def _square_pixels(frame: Any, stream: Any) -> Rgb:
 
 
 def keep_keyframes(
-    path: Path, folder: Path, config: KeyframeConfig, most: int, report: Callable[[float, str], None]
+    path: Path, folder: Path, movement: float, most: int, report: Callable[[float, str], None]
 ) -> list[Path]:
     """Write the selected frames of a video as JPEG files; finished files of an earlier run are reused.
 
     Args:
         folder: Folder of the files, which are named by their number in the video.
+        movement: See `KeyframeSelector`.
         most: Largest number of frames, evenly thinned out.
         report: Progress callback, called with the finished share and the number of frames as text.
 
     Returns:
         The files, ordered by time.
     """
-    key = _key(path, config, most)
+    key = _key(path, movement, most)
     if (done := _finished(folder, key)) is not None:
         return done
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.jpg"):  # from another choice, or an interrupted run
         old.unlink()
-    selector, kept = KeyframeSelector(config), []
+    selector, kept = KeyframeSelector(movement), []
     for number, time_s, share, rgb in read_video(path):
         if (chosen := selector.offer(number, time_s, rgb)) is not None:
             kept.append(_write(folder, chosen))
@@ -118,7 +118,7 @@ def thinned(rows: list[T], most: int) -> list[T]:
     return [rows[i] for i in np.linspace(0, len(rows) - 1, most).round().astype(int)]
 
 
-def _key(path: Path, config: KeyframeConfig, most: int) -> str:
+def _key(path: Path, movement: float, most: int) -> str:
     # The content of a video is too long to read twice; its size and modification time replace it.
     try:
         state = path.stat()
@@ -129,7 +129,10 @@ def _key(path: Path, config: KeyframeConfig, most: int) -> str:
         "bytes": state.st_size,
         "time": state.st_mtime_ns,
         "most": most,
-        **asdict(config),
+        "movement": movement,
+        "window": WINDOW,
+        "blur_limit": BLUR_LIMIT,
+        "max_wait_s": MAX_WAIT_S,
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 

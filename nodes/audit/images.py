@@ -169,10 +169,9 @@ def _import(
 
 
 def _from_media(given: Path, output: Path, metric: MetricOptions, display: ProgressDisplay) -> None:
-    from advnerf_core.data.keyframes import KeyframeConfig
     from calibration.photo_model import SfmConfig
     from nodes.lab.importing.data_set import from_media
     from nodes.lab.importing.media import MediaConfig
 
-    config = MediaConfig(KeyframeConfig(_MOVEMENT), _MOST, False)
+    config = MediaConfig(_MOVEMENT, _MOST, False)
     from_media([given], output, config, SfmConfig(seed=0), _EXTENT_M, metric, display.start("poses"))

@@ -156,13 +156,12 @@ def from_phone_and_car(
     ] = 0.08,
 ) -> None:
     """Combine phone media and the frames of a bag into one model, metric and in the motion-capture world."""
-    from advnerf_core.data.keyframes import KeyframeConfig
     from calibration.photo_model import SfmConfig
     from nodes.lab.importing.data_set import from_phone_and_car as run
     from nodes.lab.importing.driven_bag import BagConfig
     from nodes.lab.importing.media import MediaConfig
 
-    media_config = MediaConfig(KeyframeConfig(movement), most, one_camera)
+    media_config = MediaConfig(movement, most, one_camera)
     bag_config = BagConfig(step_m, math.radians(step_deg), most=most)
     _run(
         "from-phone-and-car",
@@ -292,12 +291,11 @@ def _from_media(
     metric: MetricOptions,
     seed: int,
 ) -> None:
-    from advnerf_core.data.keyframes import KeyframeConfig
     from calibration.photo_model import SfmConfig
     from nodes.lab.importing.data_set import from_media as run
     from nodes.lab.importing.media import MediaConfig
 
-    config = MediaConfig(KeyframeConfig(movement), most, one_camera)
+    config = MediaConfig(movement, most, one_camera)
     _run(
         "from-media",
         output,

@@ -7,12 +7,12 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from advnerf_core.data import image_bytes, image_files, video
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.keyframes import KeyframeConfig
+from advnerf_core.data.keyframes import MOVEMENT
 from advnerf_core.data.scan_folder import from_scan_advice
 from advnerf_core.files import write_atomically
 from calibration.photo_model import PhotoSource
@@ -28,12 +28,12 @@ class MediaConfig:
     """Settings for the conversion of media to images.
 
     Attributes:
-        keyframes: Selection of video frames.
+        movement: Displacement of the picture after which a new frame of a video is due, as a share of its width.
         most: Largest number of images of each video or folder.
         one_camera: Whether all images are from one camera with one focal length.
     """
 
-    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    movement: float = MOVEMENT
     most: int = 300
     one_camera: bool = False
 
@@ -69,7 +69,7 @@ def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Rep
         folder = output / IMAGES / name
         progress = _part_of(report, index, len(entries))
         if is_video:
-            kept = video.keep_keyframes(files[0], folder, config.keyframes, config.most, progress)
+            kept = video.keep_keyframes(files[0], folder, config.movement, config.most, progress)
         else:
             kept = _copy_photographs(video.thinned(files, config.most), folder, progress)
         images = tuple(path.relative_to(output).as_posix() for path in kept)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.keyframes import KeyframeConfig, KeyframeSelector, sharpness, work_image
+from advnerf_core.data.keyframes import MOVEMENT, KeyframeSelector, sharpness, work_image
 from advnerf_core.data.video import keep_keyframes, read_video
 
 WIDTH, HEIGHT = 320, 240
@@ -31,8 +31,8 @@ def frame_at(offset_px, blurred=False):
     return cv2.GaussianBlur(frame, (0, 0), 4.0) if blurred else np.ascontiguousarray(frame)
 
 
-def choose(offsets, blurred=(), config=None, rate_hz=30.0):
-    selector, kept = KeyframeSelector(config), []
+def choose(offsets, blurred=(), movement=MOVEMENT, rate_hz=30.0):
+    selector, kept = KeyframeSelector(movement), []
     for number, offset in enumerate(offsets):
         chosen = selector.offer(number, number / rate_hz, frame_at(offset, number in blurred))
         kept += [] if chosen is None else [chosen.number]
@@ -49,11 +49,10 @@ def test_movement_is_the_displacement_of_the_picture():
 
 
 def test_frames_come_at_steps_of_the_movement():
-    config = KeyframeConfig(movement=0.1, window=0.3)  # 32 px, looked for from 22 px on
-    kept = choose(2.0 * np.arange(150), config=config)
+    kept = choose(2.0 * np.arange(150), movement=0.1)  # 32 px, looked for from 19 px on
     steps = 2.0 * np.diff(kept[:-1])
     assert len(kept) > 8
-    assert (steps >= 20).all()
+    assert (steps >= 18).all()
     assert (steps <= 34).all()
 
 
@@ -68,7 +67,7 @@ def test_twice_the_speed_gives_the_same_number_of_frames_for_the_same_way():
 
 def test_blurred_frames_are_passed_over_for_sharp_neighbours():
     blurred = {number for number in range(120) if number % 3 != 0}
-    kept = choose(2.0 * np.arange(120), blurred=blurred, config=KeyframeConfig(movement=0.1))
+    kept = choose(2.0 * np.arange(120), blurred=blurred, movement=0.1)
     assert len(kept) > 5
     assert not blurred & set(kept)
 
@@ -100,18 +99,17 @@ def test_a_video_becomes_files_and_a_second_run_uses_them_again(tmp_path):
     assert [row[1] for row in seen[:3]] == pytest.approx([0.0, 1 / 30, 2 / 30], abs=1e-3)
     assert np.abs(seen[40][3].astype(int) - frame_at(160)).mean() < 6.0
     reports = []
-    config = KeyframeConfig(movement=0.1)
-    files = keep_keyframes(video, tmp_path / "kept", config, 100, lambda share, text: reports.append(share))
+    files = keep_keyframes(video, tmp_path / "kept", 0.1, 100, lambda share, text: reports.append(share))
     assert 6 <= len(files) <= 13
     assert sorted(files) == files
     assert reports[-1] > 0.9
     stamps = [file.stat().st_mtime_ns for file in files]
     assert (
-        keep_keyframes(video, tmp_path / "kept", config, 100, lambda share, text: pytest.fail("worked again"))
+        keep_keyframes(video, tmp_path / "kept", 0.1, 100, lambda share, text: pytest.fail("worked again"))
         == files
     )
     assert [file.stat().st_mtime_ns for file in files] == stamps
-    few = keep_keyframes(video, tmp_path / "kept", config, 5, lambda share, text: None)
+    few = keep_keyframes(video, tmp_path / "kept", 0.1, 5, lambda share, text: None)
     assert len(few) == 5
     assert sorted((tmp_path / "kept").glob("*.jpg")) == few
 
@@ -121,9 +119,7 @@ def test_what_is_no_video_is_one_error(tmp_path):
     with pytest.raises(DatasetError, match=r"video that can be decoded, got .*a\.mp4"):
         list(read_video(tmp_path / "a.mp4"))
     with pytest.raises(DatasetError, match=r"nowhere\.mp4"):
-        keep_keyframes(
-            tmp_path / "nowhere.mp4", tmp_path / "k", KeyframeConfig(), 5, lambda share, text: None
-        )
+        keep_keyframes(tmp_path / "nowhere.mp4", tmp_path / "k", MOVEMENT, 5, lambda share, text: None)
 
 
 def test_a_video_that_was_cut_off_gives_what_it_has(tmp_path):
