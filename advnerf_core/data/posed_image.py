@@ -28,8 +28,3 @@ class PosedImage:
     mask: Path | None = None
     camera_id: str = ""
     split: str | None = None
-
-    @property
-    def distortion(self) -> tuple[float, ...]:
-        """Coefficients of the lens."""
-        return self.lens.coefficients

@@ -102,7 +102,6 @@ def align_poses(
     position_tolerance_m: float,
     rotation_tolerance_rad: float,
     min_inlier_share: float = 0.5,
-    seed: int = 0,
 ) -> Alignment:
     """Find the similarity that takes one set of camera poses to the other.
 
@@ -112,7 +111,6 @@ def align_poses(
         position_tolerance_m: Largest distance of an inlier from its target [target units]; with both tolerances infinite all count.
         rotation_tolerance_rad: Largest angle of an inlier from its target [rad].
         min_inlier_share: With fewer inliers than this share the result is rejected.
-        seed: Seed of the choice of candidate pairs, if there are too many to try all.
 
     Raises:
         SimilarityError: Too few cameras, all at one place or on one line, or too few that agree.
@@ -136,7 +134,7 @@ def align_poses(
     _refuse_degenerate(target[:, :3, 3], "all")
     tolerances = (position_tolerance_m, rotation_tolerance_rad)
     everything = np.isinf(tolerances).all()
-    inliers = np.ones(len(source), np.bool_) if everything else _consensus(source, target, tolerances, seed)
+    inliers = np.ones(len(source), np.bool_) if everything else _consensus(source, target, tolerances)
     _require_share(inliers, min_inlier_share, tolerances)
     for _ in range(20):  # to a fixed point; it settles after two or three rounds
         similarity = _fit(source[inliers], target[inliers])
@@ -248,12 +246,12 @@ def _inliers(errors: tuple[Array, Array], tolerances: tuple[float, float]) -> ND
     return np.asarray((errors[0] <= tolerances[0]) & (errors[1] <= tolerances[1]))
 
 
-def _consensus(source: Array, target: Array, tolerances: tuple[float, float], seed: int) -> NDArray[np.bool_]:
+def _consensus(source: Array, target: Array, tolerances: tuple[float, float]) -> NDArray[np.bool_]:
     """The inliers of the best of many pairs of cameras: their rotations give R, their distance gives s."""
     count = len(source)
     pairs = [(i, j) for i in range(count) for j in range(i + 1, count)]
     if len(pairs) > _CANDIDATES:
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         pairs = [pairs[k] for k in rng.choice(len(pairs), _CANDIDATES, replace=False)]
     best: NDArray[np.bool_] = np.zeros(count, np.bool_)
     best_rank = (-1, -np.inf)

@@ -60,10 +60,6 @@ _SPREAD_QUANTILE = 0.9
 _Values = dict[str, Any]
 
 
-class _FieldError(ValueError):
-    """A field of one frame is wrong."""
-
-
 def load_transforms(path: str | Path, require_all: bool = False) -> PosedImages:
     """Read a ``transforms.json``, or a folder with one or with blender's ``transforms_train.json`` and similar files.
 
@@ -164,7 +160,7 @@ def _ngp_box(path: Path, content: _Values) -> tuple[float, tuple[float, float, f
         raw = content.get("offset", NGP_OFFSET)
         x, y, z = (float(v) for v in (raw if isinstance(raw, list | tuple) else [raw] * 3))
         if not np.isfinite([x, y, z]).all():
-            raise _FieldError(f"offset: expected three finite numbers, got {raw}")
+            raise ValueError(f"offset: expected three finite numbers, got {raw}")
     except (ValueError, TypeError) as error:
         raise DatasetError(f"{path}: {error}") from error
     return scale, (x, y, z), aabb
@@ -172,12 +168,12 @@ def _ngp_box(path: Path, content: _Values) -> tuple[float, tuple[float, float, f
 
 def _name_of(entry: Any) -> str:
     if not isinstance(entry, dict):
-        raise _FieldError(
+        raise ValueError(
             f"expected an object with file_path and transform_matrix, got {type(entry).__name__}"
         )
     name = entry.get("file_path")
     if not isinstance(name, str) or not name:
-        raise _FieldError(f"file_path: expected the name of an image file, got {name!r}")
+        raise ValueError(f"file_path: expected the name of an image file, got {name!r}")
     return name.replace("\\", "/")  # written on Windows
 
 
@@ -195,7 +191,7 @@ def _frame(folder: Path, image: Path, values: _Values, split: str | None) -> Pos
     mask = values.get("mask_path")
     mask_file = None if not mask else folder / str(mask).replace("\\", "/")
     if mask_file is not None and not mask_file.is_file():
-        raise _FieldError(
+        raise ValueError(
             f"mask_path: expected a mask at {mask_file}, it is missing; put it there or take the entry out"
         )
     return PosedImage(
@@ -211,11 +207,11 @@ def _frame(folder: Path, image: Path, values: _Values, split: str | None) -> Pos
 
 def _pose(values: _Values) -> Array:
     if "transform_matrix" not in values:
-        raise _FieldError("transform_matrix: expected the camera's pose, it is missing")
+        raise ValueError("transform_matrix: expected the camera's pose, it is missing")
     try:
         matrix = rigid_pose(values["transform_matrix"])
     except ValueError as error:
-        raise _FieldError(f"transform_matrix: {error}") from None
+        raise ValueError(f"transform_matrix: {error}") from None
     return np.asarray(matrix @ OPENGL_FROM_OPENCV, np.float64)
 
 
@@ -236,7 +232,7 @@ def _refuse_far_away(path: Path, frames: Sequence[PosedImage]) -> None:
 def _lens(values: _Values) -> Lens:
     model = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"))
     if model not in _LENSES | _FISHEYES or values.get("is_equirectangular") or values.get("equirectangular"):
-        raise _FieldError(
+        raise ValueError(
             f"camera_model: expected {', '.join(sorted(_LENSES | _FISHEYES))}, got {model}; undistort the images first"
         )
     for key, value in values.items():
@@ -246,7 +242,7 @@ def _lens(values: _Values) -> Lens:
             and key not in _OTHER_KEYS
             and _says_something(value)
         ):
-            raise _FieldError(
+            raise ValueError(
                 f"{key}: expected a lens of {', '.join(sorted(_LENS_KEYS - {'k5', 'k6'}))} alone, got {key} = {value!r:.60}, which other "
                 "software reads; undistort the images first, or take it out if they are ideal"
             )
@@ -255,7 +251,7 @@ def _lens(values: _Values) -> Lens:
     strange = ("p1", "p2") if fisheye else ("k4", "k5", "k6")
     for key in strange:
         if _number(values, key, 0.0) != 0.0:
-            raise _FieldError(
+            raise ValueError(
                 f"{key}: expected only {', '.join(keys)} with camera_model {model}, got {values[key]}; undistort the images first"
             )
     return Lens(tuple(_number(values, key, 0.0) for key in keys), fisheye)
@@ -285,7 +281,7 @@ def _pinhole(image: Path, values: _Values) -> Pinhole:
         width, height = image_size(image)
     fx, fy = _focal_length(values, "x", width), _focal_length(values, "y", height)
     if fx is None and fy is None:
-        raise _FieldError("fl_x: expected fl_x, camera_angle_x or x_fov, none is there")
+        raise ValueError("fl_x: expected fl_x, camera_angle_x or x_fov, none is there")
     return Pinhole(
         width,
         height,
@@ -303,7 +299,7 @@ def _focal_length(values: _Values, axis: str, size: int) -> float | None:
         if values.get(key) is not None:
             angle = unit * _number(values, key, 0.0, positive=True)
             if angle >= math.pi:
-                raise _FieldError(f"{key}: expected a field of view below a half turn, got {values[key]}")
+                raise ValueError(f"{key}: expected a field of view below a half turn, got {values[key]}")
             return 0.5 * size / math.tan(0.5 * angle)
     return None
 
@@ -315,7 +311,7 @@ def _number(values: _Values, key: str, default: float, positive: bool = False) -
             raise TypeError
         value = default if raw is None else float(raw)
     except (TypeError, ValueError):
-        raise _FieldError(f"{key}: expected a number, got {raw!r:.60}") from None
+        raise ValueError(f"{key}: expected a number, got {raw!r:.60}") from None
     if not math.isfinite(value) or (positive and value <= 0.0):
-        raise _FieldError(f"{key}: expected a {'positive' if positive else 'finite'} number, got {raw}")
+        raise ValueError(f"{key}: expected a {'positive' if positive else 'finite'} number, got {raw}")
     return value

@@ -109,17 +109,12 @@ def repair(file: Path, force: bool = False, keep_original: bool = True, in_place
     except OSError as error:
         raise BagError(f"cannot repair {path}: {error.strerror}; the file is unchanged") from error
     _complete_folder(path, scan, kept)
+    after = contents_of(scan).counts
     topics = tuple(
-        TopicRepair(name, known.get(name), after) for name, after in sorted(contents_of(scan).counts.items())
+        TopicRepair(name, known.get(name), after.get(name, 0))
+        for name in (*sorted(after), *sorted(known.keys() - after.keys()))
     )
-    gone = tuple(
-        TopicRepair(name, count, 0)
-        for name, count in sorted(known.items())
-        if name not in {t.name for t in topics}
-    )
-    return Repaired(
-        path, scan.messages, cut, False, kept, topics + gone, losses, tuple(scan.fixes), scan.unchecked
-    )
+    return Repaired(path, scan.messages, cut, False, kept, topics, losses, tuple(scan.fixes), scan.unchecked)
 
 
 def examine(path: Path) -> Scan:

@@ -11,6 +11,8 @@ import typer
 
 from nodes.cli import calibrate_display as cli_calibrate_display
 from nodes.cli import calibrate_printer as cli_calibrate_printer
+from nodes.cli.calibrate_display import Output
+from nodes.cli.calibrate_printer import Lens
 from nodes.lab.wizards.output import save_and_print
 from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import RunDir
@@ -29,15 +31,9 @@ app.command("display")(cli_calibrate_display.display)
 app.command("printer-chart")(cli_calibrate_printer.printer_chart)
 app.command("printer")(cli_calibrate_printer.printer)
 
-Output = Annotated[
-    Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")
-]
 Source = Annotated[
     Path | None,
     typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True, show_default="--live"),
-]
-Lens = Annotated[
-    Path, typer.Option("--lens", help="Lens file (car calibrate intrinsics) or camera file.", exists=True)
 ]
 
 

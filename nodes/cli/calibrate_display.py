@@ -10,6 +10,10 @@ import typer
 from nodes.lab.wizards.output import save_and_print
 from nodes.runtime.terminal import RunDir
 
+Output = Annotated[
+    Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")
+]
+
 
 def display_colours(
     output: Annotated[
@@ -42,9 +46,7 @@ def display_colours(
 
 
 def display(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")
-    ],
+    output: Output,
     folder: Annotated[
         Path,
         typer.Argument(

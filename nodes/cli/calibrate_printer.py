@@ -7,7 +7,12 @@ from typing import Annotated, Literal
 
 import typer
 
+from nodes.cli.calibrate_display import Output
 from nodes.lab.wizards.output import save_and_print
+
+Lens = Annotated[
+    Path, typer.Option("--lens", help="Lens file (car calibrate intrinsics) or camera file.", exists=True)
+]
 
 
 def printer_chart(
@@ -44,13 +49,8 @@ def printer(
         ),
     ],
     chart: Annotated[Path, typer.Option(help="The chart's .print.json file.", exists=True, dir_okay=False)],
-    lens: Annotated[
-        Path,
-        typer.Option("--lens", help="Lens file (car calibrate intrinsics) or camera file.", exists=True),
-    ],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")
-    ],
+    lens: Lens,
+    output: Output,
     conditions: Annotated[
         str, typer.Option(help="Printer, paper, light and exposure, stored in the file.")
     ] = "exposure and white balance locked",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from nodes.cli import policy_train as cli_policy_train
+from nodes.cli.policy_train import Goal
 from nodes.runtime.findings import CheckFinding
 from nodes.runtime.paths import shipped
 from nodes.runtime.terminal import PolicyName, print_findings, print_table, table
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
     from advnerf_core.policies.view import PolicyView
     from nodes.lab.policy_reference import ReferenceFrames
 
-Goal = Annotated[
-    list[float] | None, typer.Option(help="One number of the goal vector. Repeat for each number.")
-]
 ServiceMode = Literal["carla", "alpasim"]
 _TWIN_ROOM = shipped("calibration/twin/room.yaml")
 

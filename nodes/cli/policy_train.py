@@ -26,6 +26,9 @@ Camera = Annotated[
         "--camera", exists=True, help="Camera calibration.", show_default="the first one in the logs"
     ),
 ]
+Goal = Annotated[
+    list[float] | None, typer.Option(help="One number of the goal vector. Repeat for each number.")
+]
 Labels = Literal["expert", "recorded"]
 
 
@@ -201,9 +204,7 @@ def evaluate(
         int, typer.Option("--saliency", min=0, help="Number of frames for which a saliency map is drawn.")
     ] = 8,
     video: Annotated[bool, typer.Option("--video", help="Also write all saliency maps as a video.")] = False,
-    goal: Annotated[
-        list[float] | None, typer.Option(help="One number of the goal vector. Repeat for each number.")
-    ] = None,
+    goal: Goal = None,
 ) -> None:
     """Compare the steering of a policy with logs of drives: table, plots and saliency maps."""
     from advnerf_core.policies.load import load_any_policy

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -52,19 +53,21 @@ def room_path(
     from calibration.path_fit import fit_path
     from calibration.plots import save_with_plot
     from calibration.room import clearance, fence_around, start_before_corner
+    from calibration.schema import RoomCalibration
 
     trace = _trace(bag, topic)
     fit = fit_path(trace, closed)
     old = _old_room(output)
     fence = old.fence_m if old else fence_around(fit.path, fence_margin_m)
-    room = _room(
-        fit.path.to_dict(),
-        fence,
-        old.off_track_m if old else off_track_m,
-        start_before_corner(fit.path, corner, before_m),
-        f"path fitted to {topic}",
-        {"path_rms_mm": round(1e3 * fit.rms_m, 2), "path_worst_mm": round(1e3 * fit.worst_m, 2)},
-        len(fit.trace),
+    room = RoomCalibration(
+        date=date.today(),
+        method=f"path fitted to {topic}",
+        path=fit.path.to_dict(),
+        off_track_m=old.off_track_m if old else off_track_m,
+        fence_m=fence,
+        start_pose=start_before_corner(fit.path, corner, before_m),
+        residuals={"path_rms_mm": round(1e3 * fit.rms_m, 2), "path_worst_mm": round(1e3 * fit.worst_m, 2)},
+        views=len(fit.trace),
     )
     _require_clearance(clearance(fit.path, fence))
     picture = save_with_plot(room, output, lambda figure: _draw(figure, room, fit.trace, fit))
@@ -88,7 +91,7 @@ def room_fence(
     """Fit the fence to a walk around the free floor with the car or a wand. Run ``advnerf scene room path`` first."""
     from calibration.plots import save_with_plot
     from calibration.room import clearance, fence_from_trace
-    from calibration.schema import CalibrationError
+    from calibration.schema import CalibrationError, RoomCalibration
 
     old = _old_room(output)
     if old is None:
@@ -99,14 +102,15 @@ def room_fence(
     fence = fence_from_trace(trace, margin_m)
     least_m = clearance(old.reference_path, fence)
     _require_clearance(least_m)
-    room = _room(
-        old.path,
-        fence,
-        old.off_track_m,
-        old.start_pose,
-        f"{old.method}; fence walked with {topic}",
-        old.residuals,
-        old.views,
+    room = RoomCalibration(
+        date=date.today(),
+        method=f"{old.method}; fence walked with {topic}",
+        path=old.path,
+        off_track_m=old.off_track_m,
+        fence_m=fence,
+        start_pose=old.start_pose,
+        residuals=old.residuals,
+        views=old.views,
     )
     picture = save_with_plot(room, output, lambda figure: _draw(figure, room, trace))
     print(f"fence of {len(fence)} corners, at least {least_m:.2f} m from the path; {output} and {picture}")
@@ -247,33 +251,6 @@ def _old_room(file: Path) -> RoomCalibration | None:
     from calibration.schema import RoomCalibration, load_calibration
 
     return load_calibration(RoomCalibration, file) if file.exists() else None
-
-
-def _room(
-    path: dict[str, Any],
-    fence: Any,
-    off_track_m: float,
-    start: Any,
-    method: str,
-    residuals: dict[str, float],
-    views: int | None,
-) -> RoomCalibration:
-    import datetime
-
-    from calibration.schema import RoomCalibration
-
-    return RoomCalibration.model_validate(
-        {
-            "date": datetime.date.today(),
-            "method": method,
-            "path": path,
-            "off_track_m": off_track_m,
-            "fence_m": fence,
-            "start_pose": start,
-            "residuals": residuals,
-            "views": views,
-        }
-    )
 
 
 def _require_clearance(least_m: float) -> None:

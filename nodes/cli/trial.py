@@ -46,7 +46,8 @@ def trial(
     overrides: Overrides = None,
 ) -> None:
     """Drive the conditions none, random and gradient in balanced order from the same start. Resumes a stopped trial."""
-    from nodes.lab.trials.series import drive_series, prepare_series
+    from advnerf_core.files import write_json
+    from nodes.lab.trials.series import drive_series, prepare_series, summarise
 
     attacks = _attacks(attack or [])
     series = prepare_series(
@@ -75,8 +76,9 @@ def trial(
         drive_series(series, ready_timeout_s, begin, lambda text: print(f"  {text}", flush=True))
     results = list(series.results.values())
     if results:
-        _print_summary(results)
-        _write_summary(folder, results)
+        rows = summarise(results)
+        _print_summary(rows)
+        write_json(folder / "summary.json", rows)
 
 
 def evaluate(
@@ -163,9 +165,7 @@ def _pose(text: str) -> tuple[float, float, float]:
     return x, y, yaw
 
 
-def _print_summary(results: list[dict[str, Any]]) -> None:
-    from nodes.lab.trials.series import summarise
-
+def _print_summary(summary: list[dict[str, Any]]) -> None:
     rows = table(
         "condition",
         "runs",
@@ -177,7 +177,7 @@ def _print_summary(results: list[dict[str, Any]]) -> None:
         "capture to serial p50",
         "checksums",
     )
-    for row in summarise(results):
+    for row in summary:
         spread = "" if row["std_m"] is None else f" +- {row['std_m']:.3f}"
         rows.add_row(
             row["condition"],
@@ -191,10 +191,3 @@ def _print_summary(results: list[dict[str, Any]]) -> None:
             f"unchecked in {row['unchecked']}" if row["unchecked"] else "agree",
         )
     print_table(rows)
-
-
-def _write_summary(folder: Path, results: list[dict[str, Any]]) -> None:
-    from advnerf_core.files import write_json
-    from nodes.lab.trials.series import summarise
-
-    write_json(folder / "summary.json", summarise(results))
