@@ -38,7 +38,6 @@ def from_scan_advice(folder: Path, otherwise: str) -> str:
     """Advice for an error about a folder without the expected files: the import, if it is a scan.
 
     Args:
-        folder: The folder.
         otherwise: The advice if it is no scan.
     """
     found = scan_of(folder)

@@ -65,7 +65,6 @@ def assemble(scan: Scan, file_name: str, notes: dict[str, str]) -> FileLayout:
 
     Args:
         scan: The scan. The entries of its pieces get their new offsets.
-        file_name: Name of the file.
         notes: Notes about the repair to store in the file.
     """
     pieces = _with_what_is_missing(scan)

@@ -39,7 +39,6 @@ def messages_in_order(
     """Yield channel id and message of some channels from a log time on, in order of log time. Of two with the same, the one written first.
 
     Args:
-        summary: Summary of the file.
         names: Topics of the channels to read by their ids.
         start_ns: First log time [ns since 1970].
 

@@ -58,7 +58,6 @@ def stored_messages(
     """Yield number of the topic and message in order of their log time. Publish times and sequence numbers are generated.
 
     Args:
-        form: Format of the file.
         names: Topics to read by their numbers.
         start_ns: First log time [ns since 1970].
     """

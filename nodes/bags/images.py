@@ -34,7 +34,6 @@ def image_messages(bag: Path, topic: str) -> Iterator[Any]:
     """Yield the images of a topic as ``sensor_msgs/Image`` in order of log time. Compressed images are decoded.
 
     Args:
-        bag: Bag folder or file.
         topic: A topic with images. It need not be in the topic table.
     """
     for message in read_messages(bag, [topic], types={topic: IMAGE_TYPE}):

@@ -21,11 +21,7 @@ _WORDS = {
 
 
 class Keys:
-    """Reads single keys of a terminal. Ctrl-C still interrupts.
-
-    Args:
-        descriptor: File descriptor of the terminal.
-    """
+    """Reads single keys of a terminal, given by its file descriptor. Ctrl-C still interrupts."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor

@@ -154,7 +154,6 @@ def parse_definition(typename: str, text: str, encoding: str) -> Definition:
     """Parse the definition of a type from the text in a bag.
 
     Args:
-        typename: Full type name.
         text: Definition of the type and of all types in it.
         encoding: ``ros2msg``, ``ros1msg`` or ``ros2idl``.
 

@@ -199,12 +199,7 @@ def _stored(part: FileInfo, names: Mapping[int, str], start_ns: int) -> Iterator
 
 
 def require_readable(bag: Path, topics: Mapping[str, str]) -> None:
-    """Refuse a bag with a topic that cannot be converted to the wanted type.
-
-    Args:
-        bag: Bag folder or file.
-        topics: Wanted types by topic.
-    """
+    """Refuse a bag with a topic that cannot be converted to the wanted type, given by topic."""
     for part in _parts(bag):
         _converters(part, frozenset(topics), topics)
 

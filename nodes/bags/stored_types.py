@@ -47,9 +47,6 @@ class RecordedTopic:
 def converter(recorded: RecordedTopic, expected: str, source: str) -> Convert | None:
     """Return a converter from recorded bytes to CDR bytes of the expected type; None if no conversion is needed.
 
-    Args:
-        recorded: The topic in the bag.
-
     Raises:
         BagError: The topic has a type that cannot be converted to the expected one.
     """

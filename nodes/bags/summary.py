@@ -29,12 +29,7 @@ class Ending(NamedTuple):
 
 
 def read_ending(buffer: Any, size: int) -> Ending | None:
-    """Read the footer of a file; None if the file does not end with one.
-
-    Args:
-        buffer: A buffer whose slices are bytes.
-        size: Length of the buffer.
-    """
+    """Read the footer of a file; None if the file does not end with one."""
     at = size - FOOTER_BYTES - len(MAGIC)
     if at < len(MAGIC) or buffer[size - len(MAGIC) : size] != MAGIC:
         return None

@@ -132,7 +132,6 @@ def retro_attack(bag: Path, attack: Path, choice: Choice) -> RetroAttack:
 
     Args:
         bag: Bag folder or file, with camera images and poses.
-        attack: Attack file.
         choice: Nodes to run. ``compositor`` gets the attack; overrides select the policy.
     """
     clean, _, clean_digest = _steering(bag, choice, "compositor.attack=null")

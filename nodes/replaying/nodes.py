@@ -54,7 +54,6 @@ def build_nodes(bag: Path, choice: Choice, folder: Path, clock: Clock) -> dict[s
     """Build the chosen nodes.
 
     Args:
-        bag: Bag folder or file.
         folder: Empty folder for the attachments of the bag, which must exist as long as the nodes.
         clock: The clock of the replay.
     """

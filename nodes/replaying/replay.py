@@ -28,7 +28,6 @@ class Replay:
     """A bag and the nodes to run over it.
 
     Args:
-        bag: Bag folder or file.
         whole: Also yield messages of the bag to which no node subscribes (to write another bag).
 
     Topics that are not in the topic table are skipped and listed in `left_out`. Iterate once; then `summary` is complete. Use it as a

@@ -41,10 +41,6 @@ class _Record(NamedTuple):
 def read_tub(path: Path, choice: LogChoice) -> DriveLog:
     """Describe a tub.
 
-    Args:
-        path: Folder of the tub.
-        choice: Answers of the user.
-
     Raises:
         ConfigError: A record is no JSON, or lacks a value.
         LogError: The tub has no images, or not those that were chosen.

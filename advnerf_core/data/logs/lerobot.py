@@ -87,7 +87,6 @@ def read_lerobot(path: Path, choice: LogChoice) -> DriveLog:
     """Describe a data set.
 
     Args:
-        path: Folder of the data set.
         choice: Answers of the user. Steering is ``FEATURE:NAME``, for example ``action:steering`` or ``action:0``.
 
     Raises:

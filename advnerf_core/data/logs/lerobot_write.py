@@ -135,7 +135,8 @@ def _write(log: DriveLog, folder: Path, rate_hz: int, report: Report) -> Exporte
     episodes = _write_episodes(folder, rows, rate_hz)
     _write_tasks(folder / "meta/tasks.parquet")
     write_json(folder / INFO, _info(columns, len(rows), episodes, rate_hz, shapes[0]))
-    write_json(folder / "meta/stats.json", {**_statistics(columns), CAMERA: _image_statistics(sample)})
+    statistics = {name: _summary(values.astype(np.float64)) for name, values in columns.items()}
+    write_json(folder / "meta/stats.json", {**statistics, CAMERA: _image_statistics(sample)})
     _attach(folder / ATTACHED, log.attached())
     return Exported(len(rows), episodes, rate_hz, log.count - len(rows))
 
@@ -295,10 +296,6 @@ def _info(
         "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
         "features": features,
     }
-
-
-def _statistics(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    return {name: _summary(values.astype(np.float64)) for name, values in columns.items()}
 
 
 def _image_statistics(sample: Sequence[Rgb]) -> dict[str, Any]:
