@@ -43,7 +43,7 @@ def shifted(folder, shift_ns):
 
 def digest_and_length(bag):
     with Replay(bag, Choice(("compositor",), {})) as replay:
-        images = [made.message.cdr for made in replay if made.message.topic == "/compositor/image"]
+        images = [made.cdr for made in replay if made.topic == "/compositor/image"]
     return images, replay.summary.duration_s
 
 
