@@ -14,7 +14,6 @@ With ``--lab`` also a short attack on a hydrant's texture and on a ball's shape 
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,7 +27,7 @@ from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.geometry import Array, Pinhole, camera_mount, make_transform, planar_pose, rotation_z
 from advnerf_core.objects.mesh.engine import engine
 from advnerf_core.objects.mesh.field import MeshField
-from advnerf_core.objects.mesh.glb import read_glb, write_glb
+from advnerf_core.objects.mesh.glb import glb_bytes
 from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
 from advnerf_core.objects.voxel.generators import hydrant
@@ -36,6 +35,7 @@ from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.attack_lab import lab_problem
 from benchmarks.results import record_row
+from tests.support.glb import mesh_from_glb
 
 LINE, COMMAND = "mesh render", "python -m benchmarks.mesh_render"
 PINHOLE = Pinhole(200, 66, 103.6, 103.4, 100.0, 41.6)
@@ -129,9 +129,7 @@ def vertex_error(field: MeshField, seeds: int) -> tuple[float, float]:
 
 def glb_difference(field: MeshField) -> float:
     """Largest difference of a pixel between a mesh and what its GLB is read as, in 8-bit steps."""
-    with tempfile.TemporaryDirectory() as folder:
-        write_glb(Path(folder) / "mesh.glb", field.mesh)
-        again = MeshField(read_glb(Path(folder) / "mesh.glb"), field.T_world_from_object, field.scale)
+    again = MeshField(mesh_from_glb(glb_bytes(field.mesh)), field.T_world_from_object, field.scale)
     pictures = []
     for each in (field, again):
         scene = before_noise(each)

@@ -10,7 +10,6 @@ import torch
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.data.image_files import write_image
 from advnerf_core.objects.mesh.engine import MeshEngineError, engine
-from advnerf_core.objects.mesh.glb import read_glb
 from nodes.cli import main as cli
 from nodes.experiment.node.check import check
 from nodes.experiment.node.prepare import prepare
@@ -18,6 +17,7 @@ from nodes.experiment.node.printed import export_attack
 from nodes.experiment.node.search import run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
+from tests.support.glb import mesh_from_glb
 from tests.support.strangers import write_spiral
 from tests.support.tiny_request import loaded, tiny_request, with_objects
 
@@ -62,7 +62,7 @@ def test_textures_of_a_mesh_are_searched_resumed_and_exported(tmp_path):
     assert glb.name == "found.0_hydrant.glb"
     found = 1.0 / (1.0 + np.exp(-attack.objects[0].theta))
     used = prepare(request).space.surrogate.objects[0].mesh.charts >= 0
-    assert np.abs(read_glb(glb).texture - found)[used].max() < 0.6 / 255
+    assert np.abs(mesh_from_glb(glb.read_bytes()).texture - found)[used].max() < 0.6 / 255
 
 
 def test_shapes_are_searched_only_by_methods_that_read_their_scale(tmp_path):
@@ -99,7 +99,7 @@ def test_shapes_are_searched_resumed_and_exported(tmp_path, method):
     assert np.abs(shape.mesh.vertices - prepared.space.surrogate.objects[0].mesh.vertices).max() < 1e-3
     assert attack.space == "mesh_shape"
     (glb,) = export_attack(attack, tmp_path, "found")
-    assert len(read_glb(glb).vertices) == 642
+    assert len(mesh_from_glb(glb.read_bytes()).vertices) == 642
     assert len(json.loads((tmp_path / "whole" / "seed_0.json").read_text())["loss_m"]) == 3
     if method == "gradient":
         with pytest.raises(ConfigError, match="Monte Carlo"):

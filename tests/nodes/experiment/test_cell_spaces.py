@@ -14,7 +14,6 @@ import torch
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.objects.mesh.engine import MeshEngineError, engine
-from advnerf_core.objects.mesh.glb import mesh_from_glb
 from advnerf_core.report.cells import cell_from
 from advnerf_core.report.clips import ClipTrack, read_clip
 from nodes.experiment.pages.report import how_it_was_run
@@ -38,6 +37,7 @@ from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.steps.keys import NoSuchCellError, settings_hash
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
+from tests.support.glb import mesh_from_glb
 
 PLACES = Cell("right", "hardened", "random", 0)
 ONE = PlacesConfig(kind="places", samples=1, steps=1)
@@ -90,7 +90,7 @@ def test_meshes_are_searched_over_the_pictures_of_the_world(
     assert (file.space, file.attack_id) == (space.kind, data["attack_id"])
     plain = mesh_objects(experiment, space)
     for found, before in zip(file.objects, plain, strict=True):
-        again = mesh_from_glb(found.glb, found.name)
+        again = mesh_from_glb(found.glb)
         moved = np.abs(np.sort(again.vertices, axis=0) - np.sort(before.mesh.vertices, axis=0)).max()
         assert (moved < 1e-6) == (space.kind == "mesh_texture")
     # What the file holds is what was driven past.
