@@ -19,7 +19,7 @@ from advnerf_core.data.views import ImageSet
 from advnerf_core.parallel import thread_count
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.metrics import psnr
-from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, PRESETS, scene_preset
+from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, PRESETS
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, TrainedScene, TrainingReport, train_scene
 from advnerf_core.scene.train_config import DECAYS
@@ -66,7 +66,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     usual = "minutes" if arguments.seconds <= 180.0 else "best"
-    preset = scene_preset(arguments.preset or usual)
+    preset = PRESETS[arguments.preset or usual]
     began, use = time.perf_counter(), ProcessorUse()
     listed = load_transforms(arguments.data).sorted_by_name()
     training, held_out = listed.split(HELD_OUT_EVERY)

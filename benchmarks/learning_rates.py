@@ -14,7 +14,7 @@ from pathlib import Path
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import ImageSet, PosedImages
 from advnerf_core.scene.field import SceneFieldConfig
-from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, scene_preset
+from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, PRESETS
 from advnerf_core.scene.train import train_scene
 from benchmarks.exposure import compare
 from benchmarks.results import record_row
@@ -42,7 +42,7 @@ def main() -> None:
         found = {}
         for decay, rate in WAYS:
             config = replace(
-                scene_preset("minutes").train_config(steps=arguments.steps),
+                PRESETS["minutes"].train_config(steps=arguments.steps),
                 near_m=near,
                 decay=decay,
                 learning_rate=rate,
@@ -51,7 +51,7 @@ def main() -> None:
                 config = replace(config, opacity=0.0)
             found[decay, rate], _ = compare(train_scene(training, field, config), held_out)
             print(f"{name}, {decay} from {rate:g}: {found[decay, rate]:.2f} dB", flush=True)
-        chosen = scene_preset("minutes").training
+        chosen = PRESETS["minutes"].training
         gain_db = found[chosen.decay, chosen.learning_rate] - found[WAYS[0]]
         record_row(
             f"{name}: the presets' learning rate against an exponential fall from 0.01, held-out PSNR",
@@ -67,7 +67,7 @@ def main() -> None:
 
 def _scene(folder: Path) -> tuple[str, PosedImages, SceneFieldConfig, float]:
     """Name, photographs, field and nearest distance of what is learned."""
-    preset = scene_preset("minutes")
+    preset = PRESETS["minutes"]
     if (folder / "manifest.json").exists():
         experiment = Experiment.resolved_in(folder.resolve())
         field = field_config(experiment)

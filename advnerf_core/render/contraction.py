@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from advnerf_core.parallel import KERNEL_OPTIONS
 
@@ -31,15 +31,6 @@ _f = np.float32
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _NEVER = np.float32(1e30)
 _FAR = np.float32(FAR)
-
-
-def contract(points: ArrayLike) -> NDArray[np.float64]:
-    """Points ``[..., 3]`` in box coordinates, anywhere, to the unit cube."""
-    y = 2.0 * np.asarray(points, np.float64) - 1.0
-    r = np.abs(y).max(axis=-1, keepdims=True)
-    largest = np.arange(3) == np.abs(y).argmax(axis=-1)[..., None]
-    outside = np.where(largest, np.sign(y) * (2.0 - 1.0 / np.maximum(r, 1.0)), y / np.maximum(r, 1.0))
-    return np.asarray(0.25 * np.where(r <= 1.0, y, outside) + 0.5)
 
 
 def radial_stretch(shape: tuple[int, int, int]) -> Array32:
@@ -70,7 +61,7 @@ def bounded_distances(t: Array32, widths: Array32) -> tuple[Array32, Array32]:
 
 @njit(**KERNEL_OPTIONS)
 def into_cube(x, y, z):  # type: ignore[no-untyped-def]
-    """``contract`` for one point."""
+    """One point in box coordinates, anywhere, to the unit cube."""
     x, y, z = _TWO * x - _ONE, _TWO * y - _ONE, _TWO * z - _ONE
     ax, ay, az = abs(x), abs(y), abs(z)
     r = max(ax, ay, az)

@@ -22,7 +22,6 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig
 from advnerf_core.fields.spherical_harmonics import spherical_harmonics
 from advnerf_core.files import read_tensors, write_tensors
-from advnerf_core.render.contraction import contract
 from advnerf_core.render.volume_kernels import MAX_LOG_DENSITY
 
 FORMAT = "advnerf-scene-2"
@@ -123,7 +122,10 @@ class SceneFieldConfig:
 
 
 class SceneField(nn.Module):
-    """Density and colour everywhere in a box, or with a contraction everywhere; all points are in the coordinates of ``to_box``."""
+    """Density and colour everywhere in a box, or with a contraction everywhere.
+
+    All points are in box coordinates, from the low corner in units of the longest side, or in the contracted cube.
+    """
 
     def __init__(self, config: SceneFieldConfig, seed: int = 0) -> None:
         super().__init__()
@@ -138,18 +140,8 @@ class SceneField(nn.Module):
         )  # red, green, blue, unused: kernels need multiples of four
         self.background = nn.Parameter(torch.zeros(config.features), requires_grad=config.learned_background)
 
-    def to_box(self, points_in_world: Tensor) -> Tensor:
-        """Coordinates of world points ``[..., 3]`` [m] in the field: box coordinates, from the low corner in units of the longest side,
-        or in the contracted cube.
-        """
-        low = torch.tensor(self.config.origin_m, dtype=points_in_world.dtype, device=points_in_world.device)
-        in_box = (points_in_world - low) / self.config.extent_m
-        if not self.config.contraction:
-            return in_box
-        return torch.from_numpy(contract(in_box.detach().cpu().numpy())).to(in_box)
-
     def density_and_features(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Density per box side ``[N]`` and features ``[N, C]`` in (-1, 1) at points ``[N, 3]`` from ``to_box``."""
+        """Density per box side ``[N]`` and features ``[N, C]`` in (-1, 1) at points ``[N, 3]``."""
         hidden = torch.relu(self.density_1(self.grid(points)))
         out = self.density_2(hidden)
         return torch.exp(out[:, 0].clamp(max=MAX_LOG_DENSITY)), nn.functional.softsign(out[:, 1:])
@@ -159,11 +151,6 @@ class SceneField(nn.Module):
         inputs = torch.cat([features, spherical_harmonics(directions, self.config.direction_bands)], dim=-1)
         inputs = nn.functional.pad(inputs, (0, self.config.colour_inputs - inputs.shape[-1]))
         return torch.sigmoid(self.colour_2(torch.relu(self.colour_1(inputs)))[:, :3])
-
-    def density_and_colour(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density per box side ``[N]`` and the colour ``[N, 3]`` that an opaque surface at each point would have."""
-        density, features = self.density_and_features(points)
-        return density, self.decode(features, directions)
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """Parameters by name as numpy arrays that share their memory (CPU only)."""

@@ -7,13 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.scene.train_config import TrainConfig
-
-
-class PresetError(AdvnerfError, ValueError):
-    """A preset does not exist; the message lists the valid ones."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +51,3 @@ PRESETS = {
     "minutes": ScenePreset(3.0, _GRID, _COMMON),
     "best": ScenePreset(10.0, _GRID, _COMMON),
 }
-
-
-def scene_preset(name: str) -> ScenePreset:
-    """The preset of this name.
-
-    Raises:
-        PresetError: No preset has this name.
-    """
-    if name not in PRESETS:
-        raise PresetError(f"expected a preset of {', '.join(PRESETS)}, got {name!r}")
-    return PRESETS[name]

@@ -79,7 +79,6 @@ class TorchStep:
         Args:
             rays: ``[R, 6]`` in box coordinates.
             targets: Pixels ``[R, 3]``.
-            samples: Samples of those rays.
             matte: Opacities of the pixels and the colours behind them; for a field without a learned background.
             exposure: Gains on the field's colours, whose gradient is written.
         """

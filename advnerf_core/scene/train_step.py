@@ -43,14 +43,7 @@ Array32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class StepResult:
-    """Result of a training step.
-
-    Attributes:
-        loss: Mean Huber loss.
-        mse: Mean squared error.
-        rays: Number of rays.
-        samples: Number of samples.
-    """
+    """Result of a training step."""
 
     loss: float
     mse: float
@@ -156,7 +149,6 @@ class CpuStep:
         Args:
             rays: ``[R, 6]`` in box coordinates.
             targets: Pixels ``[R, 3]``.
-            samples: Samples of those rays.
             encoded: Their encodings ``[tiles, K, TILE]``, overwritten.
             matte: Opacities of the pixels and the colours behind them; for a field without a learned background.
             exposure: Gains on the field's colours, whose gradient is written.
@@ -365,7 +357,7 @@ def distortion_distances(samples: Samples, config: SceneFieldConfig) -> tuple[Ar
 
 
 def log_density(scene: SceneField, points: Array32) -> Array32:
-    """Logarithm of density per box side ``[N]`` at points ``[N, 3]`` from ``SceneField.to_box`` (CPU kernels)."""
+    """Logarithm of density per box side ``[N]`` at points ``[N, 3]`` of the field (CPU kernels)."""
     v, n = scene.arrays(), len(points)
     tiles = -(-n // TILE)
     encoded = np.zeros((tiles, scene.config.grid.width, TILE), np.float32)

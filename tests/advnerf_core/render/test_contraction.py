@@ -4,16 +4,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from advnerf_core.render.contraction import (
-    FAR,
-    bounded_distances,
-    contract,
-    into_cube,
-    radial_stretch,
-    span_before_far,
-)
+from advnerf_core.render.contraction import FAR, bounded_distances, into_cube, radial_stretch, span_before_far
 from advnerf_core.render.march import MarchConfig, Marcher, Samples
 from advnerf_core.render.occupancy import OccupancyGrid, leap_distances, refine_occupied
+from tests.support.contraction import contract
 
 SIDE_M = 8.0
 CELLS = 16

@@ -10,12 +10,12 @@ from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig
-from advnerf_core.scene.presets import PRESETS, PresetError, scene_preset
+from advnerf_core.scene.presets import PRESETS
 from advnerf_core.scene.train import TrainConfig, Trainer
 
 
 def test_presets_end_by_time_unless_steps_are_given() -> None:
-    minutes, best = scene_preset("minutes"), scene_preset("best")
+    minutes, best = PRESETS["minutes"], PRESETS["best"]
     assert minutes.train_config().max_seconds == 180.0
     assert best.train_config().max_seconds == 600.0
     assert best.train_config(minutes=2.0).max_seconds == 120.0
@@ -27,11 +27,6 @@ def test_a_contracted_field_gets_twice_the_finest_cells() -> None:
     for preset in PRESETS.values():
         assert preset.grid_for(False) == preset.grid
         assert preset.grid_for(True).finest == 2 * preset.grid.finest
-
-
-def test_an_unknown_preset_is_refused_with_the_names_that_exist() -> None:
-    with pytest.raises(PresetError, match="minutes, best, got 'quick'"):
-        scene_preset("quick")
 
 
 def images() -> ImageSet:
@@ -48,7 +43,7 @@ def test_a_preset_trains(name: str) -> None:
     )
     march = MarchConfig(near_m=0.1, smallest_step_m=0.02, largest_step_m=0.1, step_growth=0.02)
     config = dataclasses.replace(
-        scene_preset(name).train_config(steps=8), occupancy_resolution=8, max_rays=256, march=march
+        PRESETS[name].train_config(steps=8), occupancy_resolution=8, max_rays=256, march=march
     )
     trainer = Trainer(images(), field, config)
     results = [trainer.train_step() for _ in range(8)]

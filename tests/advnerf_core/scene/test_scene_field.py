@@ -219,9 +219,8 @@ def test_baked_values_are_those_of_the_field_at_the_corners(trained: TrainedScen
     rows = np.ravel_multi_index(tuple(cells.T), tuple(shape + 1))
     points = torch.from_numpy((cells / baked.leaps.cells).astype(np.float32))
     with torch.no_grad():
-        density, rgb = trained.scene.density_and_colour(
-            points, torch.tensor([[0.0, 0.0, 1.0]]).expand(len(points), 3)
-        )
+        density, features = trained.scene.density_and_features(points)
+        rgb = trained.scene.decode(features, torch.tensor([[0.0, 0.0, 1.0]]).expand(len(points), 3))
     logs = LOWEST_LOG + LOG_STEP * baked.voxels.values[rows, 0].astype(float)
     wanted = np.log(density.numpy()).clip(LOWEST_LOG, MAX_LOG_DENSITY)
     np.testing.assert_allclose(logs, wanted, atol=0.51 * LOG_STEP)

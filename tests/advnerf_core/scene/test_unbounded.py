@@ -13,7 +13,6 @@ from safetensors import safe_open
 from advnerf_core.data.views import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, look_at
-from advnerf_core.render.contraction import contract
 from advnerf_core.render.march import MarchConfig, Marcher, Samples
 from advnerf_core.render.occupancy import leap_distances
 from advnerf_core.render.rays import poses_in_box
@@ -23,6 +22,7 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.torch_step import TorchStep, render_rays
 from advnerf_core.scene.train import TrainConfig, Trainer, train_scene
 from advnerf_core.scene.train_step import CpuStep, distortion_distances
+from tests.support.contraction import contract
 
 GRID = HashGridConfig(levels=6, features=4, log2_entries=13, coarsest=8, finest=192)
 FIELD = SceneFieldConfig(
@@ -57,13 +57,10 @@ def some_rays(count: int, seed: int) -> tuple[NDArray[np.float32], Samples]:
 
 
 def test_world_points_go_to_the_cube() -> None:
-    scene = SceneField(FIELD)
     # The cube around the flat box is the inner region: z from -1 to 1.
-    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, -1.0, 1.0], [4.0, 1.0, -2.0]])
-    expected = torch.tensor(
-        [[0.5, 0.5, 0.5], [0.75, 0.25, 0.75], [(1.75 + 2) / 4, (0.25 + 2) / 4, (-0.5 + 2) / 4]]
-    )
-    torch.testing.assert_close(scene.to_box(points), expected)
+    points = np.array([[0.0, 0.0, 0.0], [1.0, -1.0, 1.0], [4.0, 1.0, -2.0]])
+    expected = [[0.5, 0.5, 0.5], [0.75, 0.25, 0.75], [(1.75 + 2) / 4, (0.25 + 2) / 4, (-0.5 + 2) / 4]]
+    np.testing.assert_allclose(contract((points - FIELD.origin_m) / FIELD.extent_m), expected)
     np.testing.assert_allclose(poses_in_box(np.eye(4)[None], FIELD.origin_m, FIELD.extent_m)[0, :, 3], 0.5)
 
 
