@@ -194,7 +194,7 @@ def view(trained, pictures, tmp_path):
     from advnerf_core.objects.voxel.build import build_from_mesh
     from advnerf_core.objects.voxel.model import save_object
 
-    save_object(tmp_path / "h.object.safetensors", build_from_mesh(hydrant(3.0), "hydrant", 16, 0))
+    save_object(tmp_path / "h.object.safetensors", build_from_mesh(hydrant().scaled(4.0), "hydrant", 16, 0))
     shown = SceneView(
         trained / "scene.safetensors", pictures, [tmp_path / "h.object.safetensors"], port=18080
     )

@@ -46,7 +46,6 @@ def build_from_mesh(
 
     Args:
         mesh: The mesh [m].
-        name: Name of the object.
         resolution: Voxels along its longest side, 8 to 128.
         steps: Steps of the refinement; 0 leaves the geometry as voxelised.
         source: Origin of the mesh, stored in the model.
@@ -104,10 +103,7 @@ def build_from_images(
     fell at the end. Keys of held-out pictures are missing if there are none.
 
     Args:
-        views: Pictures to learn from.
-        name: Name of the object.
         resolution: Voxels along the longest side.
-        steps: Steps of the fit.
         source: Origin of the pictures, stored in the model.
         progress: Called with the finished fraction and the current step.
         held_out: Pictures that are not learned from. The agreement is measured on at most 12 of each set.
@@ -187,9 +183,7 @@ def mesh_views(mesh: SurfaceMesh, count: int, pixels: int, phase: float = 0.0) -
     return PosedRgba(draw_mesh(mesh, poses, lens), poses, (lens,) * count)
 
 
-def draw_object(
-    model: ObjectModel, T_object_from_camera: Array, pinhole: Pinhole, supersample: int = 2
-) -> Array:
+def draw_object(model: ObjectModel, T_object_from_camera: Array, pinhole: Pinhole) -> Array:
     """Premultiplied pictures ``[B, H, W, 4]`` of an object in its own colours."""
     field = model.placed(np.eye(4))
     assert field.plain_colours is not None
@@ -197,7 +191,7 @@ def draw_object(
     poses = np.asarray(T_object_from_camera).reshape(-1, 4, 4)
     pictures = np.zeros((len(poses), pinhole.height * pinhole.width, 4))
     for picture, pose in zip(pictures, poses, strict=True):
-        cast = cast_object(field, pose[None], pinhole, supersample, np.float64)
+        cast = cast_object(field, pose[None], pinhole, 2, np.float64)
         picture[cast.pixels, :3] = cast.weights @ colours
         picture[cast.pixels, 3] = cast.alpha
     return pictures.reshape(len(poses), pinhole.height, pinhole.width, 4)

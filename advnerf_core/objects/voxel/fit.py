@@ -34,8 +34,6 @@ class Fit:
     """Result of a fit.
 
     Attributes:
-        grids: Density and colours.
-        steps: Number of optimiser steps.
         gain_db: Decrease of the training error from the last but one to the last fifth of the steps [dB].
     """
 
@@ -60,7 +58,6 @@ def fit_grids(
     Args:
         start: Initial grids; voxels further than two from any with density stay empty.
         steps: Optimiser steps; 0 returns the start unchanged.
-        rays: Rays per step.
         progress: Called after each step with the finished fraction and a text.
         max_seconds: Stop after this much time, if sooner [s]. The learning rate falls with the finished fraction, so that a fit
             that is stopped by time ends as smoothly as one that is stopped by steps.

@@ -15,7 +15,7 @@ _PAINT, _GLASS, _TYRE, _RIM = (0.20, 0.36, 0.62), (0.13, 0.16, 0.19), (0.07, 0.0
 _LAMP, _BRAKE_LAMP, _BUMPER = (0.95, 0.93, 0.80), (0.75, 0.05, 0.05), (0.22, 0.23, 0.25)
 
 
-def hydrant(height_m: float = 0.75) -> SurfaceMesh:
+def hydrant() -> SurfaceMesh:
     """A fire hydrant: eight-sided barrel with flanges and bonnet, two hose caps and a pumper cap to the front (x)."""
     barrel = [
         (0.0, 0.0),
@@ -48,10 +48,10 @@ def hydrant(height_m: float = 0.75) -> SurfaceMesh:
         _moved(_turned(hose, 12, _YELLOW), _along((0, 1, 0)), (0.0, 0.09, 0.43)),
         _moved(_turned(hose, 12, _YELLOW), _along((0, -1, 0)), (0.0, -0.09, 0.43)),
     ]
-    return _scaled(parts, height_m / 0.75)
+    return SurfaceMesh(tuple(parts))
 
 
-def small_car(length_m: float = 3.6) -> SurfaceMesh:
+def small_car() -> SurfaceMesh:
     """A small car that looks along x: body, cabin with windows, four wheels, lamps; wheels on z = 0."""
     half = 0.80
     body = [
@@ -81,7 +81,7 @@ def small_car(length_m: float = 3.6) -> SurfaceMesh:
         parts.append(_box((-1.755, side * 0.66, 0.78), (0.06, 0.18, 0.16), _BRAKE_LAMP))
         for x in (-1.12, 1.15):
             parts += _wheel((x, side * 0.72, 0.30), side)
-    return _scaled(parts, length_m / 3.6)
+    return SurfaceMesh(tuple(parts))
 
 
 GENERATORS: dict[str, Callable[[], SurfaceMesh]] = {"hydrant": hydrant, "car": small_car}
@@ -142,9 +142,3 @@ def _along(axis: ArrayLike) -> Array:
 
 def _moved(part: MeshPart, rotation: Array, offset: ArrayLike) -> MeshPart:
     return MeshPart(part.triangles @ rotation.T + np.asarray(offset, dtype=np.float64), part.uv, part.texture)
-
-
-def _scaled(parts: list[MeshPart], scale: float) -> SurfaceMesh:
-    if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"expected a size above zero, got a scale of {scale}")
-    return SurfaceMesh(tuple(MeshPart(part.triangles * scale, part.uv, part.texture) for part in parts))

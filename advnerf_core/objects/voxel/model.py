@@ -90,13 +90,6 @@ class ObjectModel:
             plain_colours=np.asarray(self.grids.colours[self.slots < count], dtype=np.float64),
         )
 
-    def with_colours(self, rows: ArrayLike) -> ObjectModel:
-        """The same object with other colours in the rows of theta, ``[K, 3]`` in 0..1."""
-        colours = self.grids.colours.copy()
-        colours[self.slots < self.slots.max()] = np.asarray(rows, dtype=np.float32)
-        grids = ObjectGrids(self.grids.density, colours, self.grids.box_min, self.grids.box_max)
-        return ObjectModel(self.name, grids, self.about)
-
 
 def save_object(path: Path, model: ObjectModel) -> None:
     """Write an object file, whole or not at all."""

@@ -140,7 +140,6 @@ class RayBatches:
     Args:
         low: Low corner of the box ``[3]`` [m].
         high: High corner ``[3]`` [m].
-        seed: Seed of the draws.
 
     Raises:
         FitError: No picture looks at the box.

@@ -72,7 +72,6 @@ def fit_in_stages(
     Args:
         resolution: Voxels along the longest side at the end.
         steps: Optimiser steps over all stages.
-        progress: Called with the finished fraction and a text.
         max_seconds: Stop after this much time, if sooner [s]. Time that a stage does not use goes to the later ones.
     """
     sizes = resolutions(resolution)

@@ -95,11 +95,9 @@ def test_generated_objects_stand_on_the_floor(name):
     assert np.abs(mesh.box[0] + mesh.box[1])[1] < 1e-6  # left and right alike
 
 
-def test_generated_objects_have_the_size_asked_for():
-    assert hydrant(0.9).size_m[2] == pytest.approx(0.9)
-    assert small_car(4.0).size_m[0] == pytest.approx(4.0, rel=0.02)
-    with pytest.raises(ValueError, match="above zero"):
-        hydrant(-1.0)
+def test_generated_objects_have_the_size_of_real_ones():
+    assert hydrant().size_m[2] == pytest.approx(0.75)
+    assert small_car().size_m[0] == pytest.approx(3.6, rel=0.02)
 
 
 def test_a_square_covers_the_pixels_that_projection_says():

@@ -252,12 +252,6 @@ def test_free_rows_are_those_that_can_be_seen():
     hidden = np.array([0.5, 0.5, 0.5])
     seen = images[images[..., 3] > 0.99][:, :3]
     assert np.abs(seen - hidden).max(axis=1).min() > 0.2  # nowhere does the fixed grey show through
-    recoloured = model.with_colours(np.ones((field.free_count, 3)))
-    np.testing.assert_allclose(
-        draw_object(recoloured, look_at(np.array([3.0, 0, 0]), np.zeros(3))[None], viewing_lens(9))[0, 4, 4],
-        1.0,
-        atol=1e-6,
-    )
 
 
 def test_a_file_keeps_everything(tmp_path):

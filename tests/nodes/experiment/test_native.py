@@ -74,7 +74,7 @@ def test_the_world_shows_what_composition_draws(world: Any) -> None:
 
 def test_solid_objects_stand_in_the_world_as_meshes(world: Any) -> None:
     """An object of voxels in its true surface, and a mesh, against both drawn by composition."""
-    view, surface = PolicyView(world.camera_pinhole), stand(hydrant(1.0))
+    view, surface = PolicyView(world.camera_pinhole), stand(hydrant(), height_m=1.0)
     place = make_transform(rotation_z(0.4), [3.0, 0.9, 0.05])
     voxels = build_from_mesh(surface, "hydrant", 40, steps=0).placed(place, 1.3)
     height = np.argwhere(voxels.slots < voxels.free_count)[:, 2] / voxels.slots.shape[2]
