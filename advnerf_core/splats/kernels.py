@@ -168,8 +168,7 @@ def colour_along(harmonics, x, y, z, colour):  # type: ignore[no-untyped-def]
 def _composite(at, projected, source, means, harmonics, centre, left, top, wide, high, light, found, colour):  # type: ignore[no-untyped-def]
     """Draw one Gaussian into a tile; returns how many pixels it closed.
 
-    ``light`` is the transmittance of each pixel of the tile ``[TILE * TILE]``; ``found [TILE * TILE, 5]`` red, green, blue, depth by weight,
-    and median depth.
+    ``light`` is the transmittance of each pixel of the tile ``[TILE * TILE]``; ``found [TILE * TILE, 4]`` red, green, blue, depth by weight.
     """
     row = projected[at]
     u, v, within, z = row[U], row[V], row[WITHIN], row[Z]
@@ -209,8 +208,6 @@ def _composite(at, projected, source, means, harmonics, centre, left, top, wide,
                 pixel[c] += weight * colour[c]
             pixel[3] += weight * z
             after = through - weight
-            if through >= _HALF and after < _HALF:
-                pixel[4] = z
             light[j * TILE + i] = after
             if after < _LEAST:
                 closed += 1
@@ -220,7 +217,7 @@ def _composite(at, projected, source, means, harmonics, centre, left, top, wide,
 @njit(**_EXACT)
 def draw_tiles(
     first: int, stop: int, starts: Array64i, lists: Array32i, projected: Array32, source: Array32i, means: Array32, harmonics: Array32,
-    centre: Array32, behind: Array32, rgb: Array32, expected_m: Array32, median_m: Array32, alpha: Array32,
+    centre: Array32, behind: Array32, rgb: Array32, depth_m: Array32, alpha: Array32,
 ) -> None:  # fmt: skip
     """Draw the tiles ``first..stop`` of one image.
 
@@ -236,15 +233,14 @@ def draw_tiles(
         centre: Place of the camera ``[3]`` [m].
         behind: Colour ``[3]`` behind everything.
         rgb: ``[H, W, 3]``, written.
-        expected_m: Mean depth by weight ``[H, W]`` [m], written; infinite for empty pixels.
-        median_m: Depth of the Gaussian at which half of the light is gone ``[H, W]`` [m], written; infinite if that never happens.
+        depth_m: Mean depth by weight ``[H, W]`` [m], written; infinite for empty pixels.
         alpha: ``[H, W]``, written.
     """
     height, width = alpha.shape
     across = (width + TILE - 1) // TILE
     light, found, colour = (
         np.empty(TILE * TILE, np.float32),
-        np.empty((TILE * TILE, 5), np.float32),
+        np.empty((TILE * TILE, 4), np.float32),
         np.empty(3, np.float32),
     )
     begins = np.empty(_BUCKETS + 1, np.int64)
@@ -252,8 +248,7 @@ def draw_tiles(
         top, left = TILE * (tile // across), TILE * (tile % across)
         wide, high = min(TILE, width - left), min(TILE, height - top)
         light[:] = _ONE
-        found[:, :4] = _ZERO
-        found[:, 4] = np.inf
+        found[:] = _ZERO
         count = starts[tile + 1] - starts[tile]
         still = wide * high
         if count > 0:
@@ -291,8 +286,7 @@ def draw_tiles(
                     rgb[top + j, left + i, c] = min(found[n, c] + light[n] * behind[c], _ONE)
                 opacity = _ONE - light[n]
                 alpha[top + j, left + i] = opacity
-                expected_m[top + j, left + i] = found[n, 3] / opacity if opacity > _f(1e-3) else _f(np.inf)
-                median_m[top + j, left + i] = found[n, 4]
+                depth_m[top + j, left + i] = found[n, 3] / opacity if opacity > _f(1e-3) else _f(np.inf)
 
 
 @njit(**_EXACT)

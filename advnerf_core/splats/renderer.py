@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +19,7 @@ from advnerf_core.splats.projection import View, drawn_within
 NEAR_M = 0.05
 _SLOTS = 16
 Corner = tuple[float, float, float]
-_Images = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+_Images = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 
 class SplatRenderer:
@@ -30,9 +28,7 @@ class SplatRenderer:
     Like all scenes here it is seen by ideal pinholes: the images of a data set are undistorted when they are loaded.
 
     Args:
-        splats: The Gaussians.
         behind: Colour ``[3]`` behind everything.
-        depth: ``expected`` is the mean over the light of a pixel, as of fields; ``median`` is the depth at which half of the light is gone.
         near_m: Gaussians whose centres are nearer are left out [m].
         box: Low and high corner of the scene [m], for views of it and for baking; None: where nearly all Gaussians are.
     """
@@ -41,7 +37,6 @@ class SplatRenderer:
         self,
         splats: GaussianSplats,
         behind: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        depth: Literal["expected", "median"] = "expected",
         near_m: float = NEAR_M,
         box: tuple[Corner, Corner] | None = None,
     ) -> None:
@@ -49,7 +44,7 @@ class SplatRenderer:
             low, high = ((float(x), float(y), float(z)) for x, y, z in central_box(splats))
             box = low, high
         self.box = box
-        self.splats, self.behind, self.depth, self.near_m = splats, behind, depth, near_m
+        self.splats, self.behind, self.near_m = splats, behind, near_m
         self._covariances, self._within = splats.covariances(), drawn_within(splats.opacities)
 
     @property
@@ -66,7 +61,7 @@ class SplatRenderer:
             T_world_from_camera: Poses ``[B, 4, 4]``.
 
         Returns:
-            Colours ``[B, H, W, 3]`` in 0..1, planar depth ``[B, H, W]`` [m] (infinite for empty pixels) and opacity ``[B, H, W]``, all
+            Colours ``[B, H, W, 3]`` in 0..1, planar depth by weight ``[B, H, W]`` [m] (infinite for empty pixels) and opacity ``[B, H, W]``, all
             float32 without history.
         """
         if isinstance(T_world_from_camera, Tensor):
@@ -76,10 +71,9 @@ class SplatRenderer:
             raise ValueError(f"expected poses [B, 4, 4], got {poses.shape}")
         shape = (len(poses), pinhole.height, pinhole.width)
         rgb = np.empty((*shape, 3), np.float32)
-        expected_m, median_m, alpha = (np.empty(shape, np.float32) for _ in range(3))
+        depth_m, alpha = (np.empty(shape, np.float32) for _ in range(2))
         for n, pose in enumerate(poses):
-            self._draw(pose, pinhole, (rgb[n], expected_m[n], median_m[n], alpha[n]))
-        depth_m = expected_m if self.depth == "expected" else median_m
+            self._draw(pose, pinhole, (rgb[n], depth_m[n], alpha[n]))
         return torch.from_numpy(rgb), torch.from_numpy(depth_m), torch.from_numpy(alpha)
 
     __call__ = render

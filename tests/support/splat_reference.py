@@ -33,7 +33,7 @@ def render_reference(
         behind: Colour ``[3]`` behind everything.
 
     Returns:
-        ``rgb [H, W, 3]``, ``alpha``, ``expected_m`` and ``median_m`` ``[H, W]``: see `SplatRenderer`.
+        ``rgb [H, W, 3]``, ``alpha`` and ``depth_m`` ``[H, W]``: see `SplatRenderer`.
     """
     view = View.of(T_world_from_camera, pinhole, near_m)
     found = _projected(splats, view, pinhole)
@@ -43,7 +43,6 @@ def render_reference(
     x, y = (each.reshape(-1).to(torch.float32) + 0.5 for each in (columns, rows))
     through = torch.ones(len(x), dtype=torch.float64)
     rgb, depth = torch.zeros(len(x), 3, dtype=torch.float64), torch.zeros(len(x), dtype=torch.float64)
-    median = torch.full((len(x),), torch.inf, dtype=torch.float64)
     for n in range(len(found["z"])):
         dx, dy = x - found["u"][n], y - found["v"][n]
         q = (found["a"][n] * dx * dx + found["c"][n] * dy * dy) + found["b2"][n] * dx * dy
@@ -52,9 +51,7 @@ def render_reference(
         weight = torch.where(drawn, through * alpha, 0.0)
         rgb += weight[:, None] * found["colour"][n]
         depth += weight * found["z"][n]
-        after = through - weight
-        median = torch.where((through >= 0.5) & (after < 0.5), found["z"][n].double(), median)
-        through = after
+        through = through - weight
     shape = (pinhole.height, pinhole.width)
     opacity = 1.0 - through
     rgb = (rgb + through[:, None] * torch.as_tensor(np.asarray(behind, np.float64))).clamp(max=1.0)
@@ -62,8 +59,7 @@ def render_reference(
     return {
         "rgb": rgb.reshape(*shape, 3),
         "alpha": opacity.reshape(shape),
-        "expected_m": expected.reshape(shape),
-        "median_m": median.reshape(shape),
+        "depth_m": expected.reshape(shape),
     }
 
 

@@ -42,17 +42,6 @@ def test_the_opacity_is_clamped_and_the_nearer_gaussian_is_in_front():
     np.testing.assert_allclose(rgb[0, 17, 25], [0.99, 0.0099, 0.0], atol=1e-5)
     np.testing.assert_allclose(alpha[0, 17, 25], 1.0 - 0.01**2, atol=1e-5)
     np.testing.assert_allclose(depth_m[0, 17, 25], (0.99 * 2.0 + 0.0099 * 4.0) / 0.9999, rtol=1e-5)
-    median_m = SplatRenderer(two, depth="median").render(AHEAD[None], LENS)[1]
-    assert median_m[0, 17, 25] == 2.0
-
-
-def test_the_median_depth_is_where_half_of_the_light_is_gone():
-    three = gaussians([[0.0, 0.0, z] for z in (1.0, 2.0, 3.0)], 0.3, [0.3, 0.4, 0.9], np.full((3, 3), 0.5))
-    median_m = SplatRenderer(three, depth="median").render(AHEAD[None], LENS)[1]
-    assert median_m[0, 17, 25] == 2.0  # 0.7 * 0.6 < 0.5
-    assert torch.isinf(
-        SplatRenderer(three.chosen(np.array([0])), depth="median").render(AHEAD[None], LENS)[1]
-    ).all()
 
 
 def test_the_colour_depends_on_the_direction_as_the_harmonics_say():
@@ -73,14 +62,13 @@ def test_it_equals_plain_torch(bands):
     splats = random_splats(400, seed=bands, bands=bands)
     pose = look_at(np.array([-2.0, 0.4, 0.5]), np.array([1.0, 0.0, 0.0]))
     expected = render_reference(splats, pose, LENS, NEAR_M, (0.2, 0.4, 0.6))
-    rgb, expected_m, alpha = SplatRenderer(splats, (0.2, 0.4, 0.6)).render(pose[None], LENS)
-    median_m = SplatRenderer(splats, depth="median").render(pose[None], LENS)[1]
+    rgb, depth_m, alpha = SplatRenderer(splats, (0.2, 0.4, 0.6)).render(pose[None], LENS)
     assert float((rgb[0] - expected["rgb"]).abs().max()) < 1e-4
     assert float((alpha[0] - expected["alpha"]).abs().max()) < 1e-4
-    for found, right in ((expected_m[0], expected["expected_m"]), (median_m[0], expected["median_m"])):
-        assert torch.equal(torch.isinf(found), torch.isinf(right))
-        seen = torch.isfinite(right)
-        assert float((found - right)[seen].abs().max()) < 1e-4
+    found, right = depth_m[0], expected["depth_m"]
+    assert torch.equal(torch.isinf(found), torch.isinf(right))
+    seen = torch.isfinite(right)
+    assert float((found - right)[seen].abs().max()) < 1e-4
     assert 0.3 < float(alpha.mean()) < 0.99
 
 
@@ -111,7 +99,7 @@ def test_a_room_of_gaussians_looks_like_its_walls():
     size_m = (4.0, 4.0, 2.4)
     walls = room(60_000, size_m=size_m)
     pose = look_at(np.array([-1.0, 0.3, 0.0]), np.array([2.0, 0.0, 0.1]))
-    rgb, depth_m, alpha = SplatRenderer(walls, depth="median").render(pose[None], LENS)
+    rgb, depth_m, alpha = SplatRenderer(walls).render(pose[None], LENS)
     directions = LENS.directions() @ pose[:3, :3].T
     with np.errstate(divide="ignore"):
         walls_m = (np.sign(directions) * np.array(size_m) / 2.0 - pose[:3, 3]) / directions
