@@ -98,14 +98,13 @@ class OverBackground(PSIntegrator):
 
 
 class ProjectiveRenderer:
-    """Pictures of a mesh over a background, and their derivatives.
+    """Derivatives of pictures of a mesh over a background.
 
     Args:
         vertex_count: Number of vertices; their positions are given with each picture.
         faces: Corners ``[F, 3]``.
         corner_texels: Positions of the corners in the texture ``[F, 3, 2]``.
         texture: Colours ``[H, W, 3]`` in 0..1.
-        pinhole: Camera.
         samples: Rays a pixel inside the silhouettes.
         boundary_samples: Points a pixel on the silhouettes.
     """
@@ -132,19 +131,6 @@ class ProjectiveRenderer:
         self._parameters = mi.traverse(self._scene)
         self._parameters.keep([_VERTICES])
 
-    def image(
-        self,
-        vertices: Array,
-        rgb: NDArray[np.float32],
-        depth_m: NDArray[np.float32],
-        samples: int,
-        seed: int = 0,
-    ) -> NDArray[np.float32]:
-        """The picture ``[H, W, 3]`` itself, with random rays; arguments as in :meth:`gradient`."""
-        self._place(vertices, rgb, depth_m)
-        self._parameters.update()
-        return np.array(mi.render(self._scene, integrator=self._integrator, spp=samples, seed=_seed(seed)))
-
     def gradient(
         self,
         vertices: Array,
@@ -163,22 +149,15 @@ class ProjectiveRenderer:
             seed: Seed of the samples; the same seed gives the same estimate, to the bit.
         """
         engine(in_order=True)  # many samples add to one vertex
-        positions = self._place(vertices, rgb, depth_m, attached=True)
+        self._integrator.stand_before(rgb, depth_m)
+        positions = floats(mi, vertices * self._square)
+        dr.enable_grad(positions)
+        self._parameters[_VERTICES] = positions
         self._parameters.update()
         slopes = mi.TensorXf(floats(mi, grad_image), grad_image.shape)
         self._integrator.render_backward(self._scene, None, slopes, seed=_seed(seed))
         gradient = np.array(dr.grad(positions), np.float64).reshape(-1, 3)
         return np.asarray(gradient * self._square)
-
-    def _place(
-        self, vertices: Array, rgb: NDArray[np.float32], depth_m: NDArray[np.float32], attached: bool = False
-    ) -> Any:
-        self._integrator.stand_before(rgb, depth_m)
-        positions = floats(mi, vertices * self._square)
-        if attached:
-            dr.enable_grad(positions)
-        self._parameters[_VERTICES] = positions
-        return positions
 
 
 def _sensor(pinhole: Pinhole) -> dict[str, Any]:

@@ -34,7 +34,6 @@ class ShapeLimits:
 
     Attributes:
         bound_m: Largest displacement of a vertex, in the world [m].
-        smoothness: Lambda of the preconditioner.
         samples: Rays a pixel for the gradient inside the silhouettes.
         boundary_samples: Points a pixel for the gradient of the silhouettes.
     """
@@ -55,11 +54,6 @@ class ShapeLimits:
         if self.samples < 1 or self.boundary_samples < 1:
             raise ValueError(f"expected at least one sample a pixel of each kind, got {self}")
 
-    @property
-    def learning_rate(self) -> float:
-        """A step of Adam in ``theta`` that reaches the bound in some twenty iterations [m]."""
-        return 0.05 * self.bound_m
-
 
 # Noise of vertices, in units of theta: N(0, 1) would fold the surface.
 _INITIAL_NOISE = 1e-4
@@ -70,14 +64,14 @@ class ShapeSensor:
 
     Args:
         surrogate: Scene and camera, with the meshes in their plain shape; all objects must be meshes (`MeshField`).
-        colours: Colours of the meshes, of ``surrogate.theta_shape``; their plain ones if not given.
+
+    Attributes:
+        colours: Plain colours of the meshes, of ``surrogate.theta_shape``.
     """
 
-    def __init__(
-        self, surrogate: Surrogate, limits: ShapeLimits | None = None, colours: Tensor | None = None
-    ) -> None:
+    def __init__(self, surrogate: Surrogate, limits: ShapeLimits | None = None) -> None:
         self.surrogate, self.limits = surrogate, limits or ShapeLimits()
-        self.colours = surrogate.plain_theta() if colours is None else colours.detach()
+        self.colours = surrogate.plain_theta()
         self.meshes: list[MeshField] = [field for field in surrogate.objects if isinstance(field, MeshField)]
         if not self.meshes or len(self.meshes) != len(surrogate.objects):
             raise ValueError(
@@ -101,8 +95,8 @@ class ShapeSensor:
 
     @property
     def learning_rate(self) -> float:
-        """Step of Adam in ``theta`` that suits the limits [m]."""
-        return self.limits.learning_rate
+        """A step of Adam in ``theta`` that reaches the bound in some twenty iterations [m]."""
+        return 0.05 * self.limits.bound_m
 
     @cached_property
     def random_sigma(self) -> float:
@@ -163,14 +157,6 @@ class ShapeSensor:
             return self._pulled_back(theta, total).to(theta.dtype)
 
         return Rendered(images, vjp, images.nbytes + rgb.nbytes + depth_m.nbytes)
-
-    def overlay(
-        self, rgb: ArrayLike, depth_m: ArrayLike, T_world_from_camera: ArrayLike, theta: Tensor
-    ) -> Tensor:
-        """Render the shaped meshes over given images; see ``Surrogate.overlay``."""
-        return self.surrogate.with_objects(self.shaped(theta)).overlay(
-            rgb, depth_m, T_world_from_camera, self.colours
-        )
 
     def _displaced(self, k: int, part: Tensor) -> Tensor:
         return torch.from_numpy(self._steps[k].solve(part.numpy()))
