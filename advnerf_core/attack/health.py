@@ -25,55 +25,12 @@ from advnerf_core.attack.adjoint import (
     roll_out,
 )
 from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.rollout import Remembering, Rollout
 from advnerf_core.geometry import Array
-from advnerf_core.scene.surrogate import PoseBatch, Rendered, Surrogate
+from advnerf_core.scene.surrogate import Rendered, Surrogate
 
 # Controls within this share of the steering range of its end count as saturated: they cannot increase further.
 _SATURATED = 1e-3
-
-
-class RememberedFrames:
-    """A surrogate that prepares each camera pose once: for many thetas on the same poses."""
-
-    def __init__(self, surrogate: Surrogate) -> None:
-        self._surrogate = surrogate
-        self._frames: dict[bytes, PoseBatch] = {}
-
-    @property
-    def theta_shape(self) -> tuple[int, ...]:
-        """Shape of the attacked parameters."""
-        return self._surrogate.theta_shape
-
-    def initial_theta(self, generator: torch.Generator) -> Tensor:
-        """Initial parameters of an attack."""
-        return self._surrogate.initial_theta(generator)
-
-    def camera_poses(self, states: Tensor) -> Array:
-        """``T_world_from_camera [B, 4, 4]`` at car states ``[B, n]``, detached."""
-        return self._surrogate.camera_poses(states)
-
-    def render(self, T_world_from_camera: Array, theta: Tensor) -> Rendered:
-        """Images at camera poses ``[B, 4, 4]`` with their vjp."""
-        key = T_world_from_camera.tobytes()
-        if key not in self._frames:
-            self._frames[key] = self._surrogate.prepare(T_world_from_camera)
-        return self._frames[key].render(theta.detach())
-
-    def sense(self, states: Tensor, theta: Tensor) -> Rendered:
-        """Images of the car's camera from states ``[B, n]``."""
-        return self.render(self.camera_poses(states), theta)
-
-
-def with_remembered_frames(problem: AttackProblem) -> AttackProblem:
-    """The problem with a sensor that prepares each pose once; memory grows with the poses."""
-    sensor = problem.sensor
-    if isinstance(sensor, DisplayedSensor):
-        assert isinstance(sensor.sensor, Surrogate)
-        return replace(problem, sensor=replace(sensor, sensor=RememberedFrames(sensor.sensor)))
-    assert isinstance(sensor, Surrogate)
-    return replace(problem, sensor=RememberedFrames(sensor))
 
 
 def frozen_loss(problem: AttackProblem, theta: Tensor, rollout: Rollout) -> float:
@@ -149,7 +106,7 @@ def tick_health(problem: AttackProblem, result: AdjointResult) -> TickHealth:
     # The loss is a mean over the starts, and so are its adjoints: multiply by their number, so that it does not matter.
     lambdas = result.lambdas.double() * len(problem.start_states)
     visible: tuple[float, ...] = ()
-    if isinstance(problem.sensor, Surrogate | RememberedFrames):
+    if isinstance(problem.sensor, Surrogate):
         probe = torch.zeros(problem.sensor.theta_shape, dtype=problem.start_states.dtype)
         visible = tuple(_share_that_sees(problem, states, probe) for states in result.rollout.states[:-1])
     return TickHealth(

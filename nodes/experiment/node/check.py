@@ -24,7 +24,6 @@ from advnerf_core.attack.health import (
     slopes_of,
     tick_health,
     time_split,
-    with_remembered_frames,
 )
 from advnerf_core.attack.health_plot import draw_health
 from advnerf_core.attack.methods import alternatives, black_box_methods
@@ -134,20 +133,22 @@ def check(request: Experiment, directions: int, memory: bool, report: Report) ->
 
 
 def in_double(prepared: Prepared) -> AttackProblem:
-    """The problem in float64, where finite differences can confirm a gradient; the learned background stays float32."""
+    """The problem in float64, where finite differences can confirm a gradient; the learned background stays float32.
+
+    Its frames are remembered, as finite differences with frozen poses ask for the same ones again.
+    """
     problem, policy = prepared.problem, prepared.problem.policy
     if isinstance(policy, nn.Module):
         policy = copy.deepcopy(policy).double().eval()
     goals = None if problem.goals is None else problem.goals.double()
-    surrogate = prepared.space.surrogate.in_type(torch.float64)
+    surrogate = prepared.space.surrogate.in_type(torch.float64).remembering(problem.cache_bytes)
     sensor = colour_space(prepared.experiment, surrogate).sensor
     return replace(problem, policy=policy, sensor=sensor, goals=goals)
 
 
 def _frozen_slopes(problem: AttackProblem, theta: Tensor, along: Tensor) -> tuple[AdjointResult, Any]:
-    remembered = with_remembered_frames(problem)
-    reference = adjoint_gradient(remembered, theta)
-    loss = partial(frozen_loss, remembered, rollout=reference.rollout)
+    reference = adjoint_gradient(problem, theta)
+    loss = partial(frozen_loss, problem, rollout=reference.rollout)
     return reference, central_slopes(loss, theta, along, _STEP)
 
 
