@@ -28,7 +28,6 @@ from advnerf_core.attack.objective import loss_slopes
 from advnerf_core.attack.problem import (
     AttackProblem,
     BlackBoxError,
-    RecurrentPolicy,
     SearchDivergedError,
     Sensor,
     Totals,
@@ -38,7 +37,7 @@ from advnerf_core.driving.rollout import Remembering, Rollout, drive
 from advnerf_core.scene.surrogate import Rendered
 
 __all__ = [
-    "AdjointResult", "AttackProblem", "BlackBoxError", "RecurrentPolicy", "RenderCache", "Sensor", "Totals", "adjoint_gradient", "adjoint_states",
+    "AdjointResult", "AttackProblem", "BlackBoxError", "RenderCache", "Sensor", "Totals", "adjoint_gradient", "adjoint_states",
     "evaluate", "gradient_pass", "roll_out",
 ]  # fmt: skip
 

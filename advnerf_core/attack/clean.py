@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import evaluate
-from advnerf_core.attack.problem import AttackProblem, drive_scores, horizon_of
+from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.driving.clean_drive import CleanDrive
 
 
@@ -13,8 +13,8 @@ def clean_drive(problem: AttackProblem, plain_theta: Tensor) -> CleanDrive:
     """Drive without disturbances and without an attack.
 
     Args:
-        problem: The attack problem.
         plain_theta: Parameters of the objects without an attack.
     """
     rollout, _ = evaluate(problem.undisturbed(), plain_theta)
-    return CleanDrive.of(drive_scores(problem, rollout.states), horizon_of(problem))
+    drives = problem.judged(rollout.states)
+    return CleanDrive.of(drives.metrics, drives.horizon)

@@ -19,7 +19,7 @@ from advnerf_core.attack.objective import (
 )
 from advnerf_core.attack.robustness import Disturbances, PosedSensor
 from advnerf_core.driving.dynamics import Dynamics
-from advnerf_core.driving.metrics import LAB_OFF_TRACK_M, DriveMetrics, Horizon
+from advnerf_core.driving.metrics import LAB_OFF_TRACK_M, Horizon
 from advnerf_core.driving.path import Path
 from advnerf_core.driving.solids import Solids
 from advnerf_core.errors import AdvnerfError
@@ -81,24 +81,13 @@ class ScaledSensor(Protocol):
         """Spread of random thetas."""
 
 
-class RecurrentPolicy(Protocol):
-    """A policy with memory: hidden units, or a stack of past frames. ``stateless`` is False."""
-
-    stateless: bool
-
-    def initial_memory(self, batch: int) -> Tensor:
-        """Memory ``[B, ...]`` before the first image."""
-
-    def __call__(self, images: Tensor, goals: Tensor | None, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Steering ``[B]`` and the next memory."""
-
-
 @dataclass(frozen=True, eq=False)
 class AttackProblem:
     """Everything an attack needs except ``theta``.
 
     Attributes:
-        policy: Frozen policy in eval mode; ``stateless`` decides which adjoint is used.
+        policy: Frozen policy in eval mode; ``stateless`` decides which adjoint is used. One with memory has ``initial_memory(B)``,
+            ``[B, ...]``, takes a memory after the goals, and returns the next one after the steering.
         sensor: Differentiable sensor, usually a ``Surrogate``.
         dynamics: Vehicle model with Jacobians.
         path: Reference path.
@@ -222,7 +211,8 @@ class AttackProblem:
 
     def judged(self, states: Tensor) -> JudgedDrives:
         """Drives of states ``[T + 1, B, n]`` in the form that an objective judges."""
-        return JudgedDrives(states, self.path, horizon_of(self), self.fence_m, self.solids)
+        horizon = Horizon(self.steps, self.dynamics.dt_s, self.off_track_m, self.held_cap_m)
+        return JudgedDrives(states, self.path, horizon, self.fence_m, self.solids)
 
     def losses(self, states: Tensor) -> Tensor:
         """Loss ``[B]`` of each drive of states ``[T + 1, B, n]``, without the regulariser; differentiable in the states."""
@@ -257,13 +247,3 @@ class Totals:
         return Totals(
             self.total_cte_m[chosen], self.protocol_cte_m[chosen], self.losses[chosen], self.values[chosen]
         )
-
-
-def horizon_of(problem: AttackProblem) -> Horizon:
-    """Horizon over which the protocol sums a problem's drives."""
-    return Horizon(problem.steps, problem.dynamics.dt_s, problem.off_track_m, problem.held_cap_m)
-
-
-def drive_scores(problem: AttackProblem, states: Tensor) -> list[DriveMetrics]:
-    """The protocol's metrics of each drive of states ``[T + 1, B, n]``; the car stops at the fence."""
-    return list(problem.judged(states).metrics)

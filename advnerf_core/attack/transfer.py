@@ -14,16 +14,18 @@ the excess is predicted too. The car is the problem's: give it the deployed car'
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from advnerf_core.attack.objective import JudgedDrives
 from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.rollout import drive
 from advnerf_core.scene.fidelity import Effect, SceneAgreement
 
@@ -34,11 +36,8 @@ FEWEST_DRAWS = 9
 DEFAULT_DRAWS = 20
 
 
-class AttackableScene(Protocol):
-    """Pictures with or without the attack from the same states."""
-
-    def __call__(self, states: Tensor, attacked: bool) -> Tensor:
-        """Images ``[B, 3, H, W]`` seen from states ``[B, n]``."""
+AttackableScene = Callable[[Tensor, bool], Tensor]
+"""Images ``[B, 3, H, W]`` seen from states ``[B, n]``, with or without the attack."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,6 @@ def predict_transfer(
         clean: Agreement of the steering on held-out views without attack, in the order of the path.
         effect: Effect of this attack on the same views.
         starts: Start states ``[S, n]`` of the deployed drives; the draws take turns.
-        horizon: Horizon of a drive.
         draws: Drives of each kind.
         none_m: The draws without attack from a prediction with the same clean views, starts, draws and seed; they do not
             depend on the attack.
@@ -120,7 +118,9 @@ def predict_transfer(
         noise = torch.from_numpy(residual - disagreement if attacked else -disagreement)
         policy = _AsDeployed(problem.policy, images, share, noise, attacked)
         rollout = drive(policy, lambda states: states, problem.dynamics, starts, horizon.ticks, goals)
-        totals[attacked] = _totals(problem, rollout.states, horizon)
+        limits = replace(horizon, held_cap_m=problem.held_cap_m)
+        judged = JudgedDrives(rollout.states.double(), problem.path, limits, problem.fence_m)
+        totals[attacked] = tuple(each.total_cte_m for each in judged.metrics)
     return TransferPrediction(totals[True], totals[False], effect.retained, horizon.ticks)
 
 
@@ -166,12 +166,3 @@ class _AsDeployed:
             steering = plain + self._share * (self._policy(self._images(images, True), goals) - plain)
         self._tick += 1
         return torch.as_tensor(steering + self._noise[self._tick - 1].to(steering.dtype))
-
-
-def _totals(problem: AttackProblem, states: Tensor, horizon: Horizon) -> tuple[float, ...]:
-    found, limits = [], replace(horizon, held_cap_m=problem.held_cap_m)
-    for one in states.double().transpose(0, 1).numpy():
-        outside = np.flatnonzero((np.abs(one[:, :2]) > (problem.fence_m or np.inf)).any(axis=1))
-        stopped = int(outside[0]) if outside.size else None
-        found.append(drive_metrics(problem.path, one, limits, stopped).total_cte_m)
-    return tuple(found)

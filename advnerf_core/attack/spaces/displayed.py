@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.problem import ColouringSensor, Sensor
-from advnerf_core.attack.robustness import PosedSensor
 from advnerf_core.display import DARKEST, PAIRS, DisplayModel
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array
@@ -49,12 +48,13 @@ class DisplayedSensor:
     """A sensor whose colours are shown on a monitor, or printed.
 
     Attributes:
-        sensor: Renders ``theta`` with the last axis red, green, blue before squashing.
+        sensor: A `Sensor` that renders ``theta`` with the last axis red, green, blue before squashing; the methods and objects beyond
+            `Sensor` work if it has them (`ColouringSensor`, `PosedSensor`).
         model: The monitor, or the print, before the camera.
         cos_angle: Cosine of the camera's viewing angle to the panel, averaged over a drive.
     """
 
-    sensor: Sensor
+    sensor: Any
     model: DisplayModel
     cos_angle: float = field(default=1.0)
 
@@ -65,12 +65,12 @@ class DisplayedSensor:
 
     @property
     def objects(self) -> Sequence[ColouredObject]:
-        """Objects of the sensor behind it, which must have them (`ColouringSensor`)."""
-        return self._coloured.objects
+        """Objects of the sensor behind it."""
+        return self.sensor.objects
 
     def plain_theta(self) -> Tensor:
         """Shown colours that look like the plain colours of the sensor behind it, as in `initial_theta`."""
-        return self._coloured.plain_theta()
+        return self.sensor.plain_theta()
 
     def initial_theta(self, generator: torch.Generator) -> Tensor:
         """Initial parameters: shown colours that look like those of the sensor behind it."""
@@ -85,28 +85,12 @@ class DisplayedSensor:
         return self._shown(lambda seen: self.sensor.sense(states, seen), theta)
 
     def camera_poses(self, states: Tensor) -> Array:
-        """Camera poses of the sensor behind it, which must have them (`PosedSensor`)."""
-        return self._posed.camera_poses(states)
+        """Camera poses of the sensor behind it."""
+        return self.sensor.camera_poses(states)
 
     def render(self, T_world_from_camera: Array, theta: Tensor) -> Rendered:
         """The same as `sense` at camera poses ``[B, 4, 4]``."""
-        return self._shown(lambda seen: self._posed.render(T_world_from_camera, seen), theta)
-
-    @property
-    def _coloured(self) -> ColouringSensor:
-        if not isinstance(self.sensor, ColouringSensor):
-            raise TypeError(
-                f"expected a sensor with objects and plain_theta, got {type(self.sensor).__name__}"
-            )
-        return self.sensor
-
-    @property
-    def _posed(self) -> PosedSensor:
-        if not isinstance(self.sensor, PosedSensor):
-            raise TypeError(
-                f"expected a sensor with camera_poses and render, got {type(self.sensor).__name__}"
-            )
-        return self.sensor
+        return self._shown(lambda seen: self.sensor.render(T_world_from_camera, seen), theta)
 
     def _shown(self, render: Callable[[Tensor], Rendered], theta: Tensor) -> Rendered:
         leaf = theta.detach().requires_grad_(True)

@@ -38,7 +38,6 @@ class PlacedSensor:
     """A surrogate that fits the attack's ``Sensor`` with placements, and colours if wanted, as its theta.
 
     Args:
-        surrogate: The scene with the objects.
         space: Allowed placements of the same objects.
         free_colours: Whether the colours belong to theta.
         colours: The colours if they are not free, of the surrogate's ``theta_shape``; plain ones if not given.
@@ -114,17 +113,10 @@ class PlacedSensor:
             return self.fixed_colours
         return theta[self.pose_count :].reshape(self.surrogate.theta_shape)
 
-    def sharp(self, theta: Tensor, opaque: bool | None = None) -> tuple[Surrogate, Tensor]:
-        """The surrogate with the objects at their placements, with true edges, and its theta (the colours).
-
-        Args:
-            theta: Placements and colours.
-            opaque: True composes without blending, as some deployments do; None as the surrogate does.
-        """
+    def sharp(self, theta: Tensor) -> tuple[Surrogate, Tensor]:
+        """The surrogate with the objects at their placements, with true edges, and its theta (the colours)."""
         objects = placed(self.space.objects, self.placements(theta.detach()))
-        return self.surrogate.with_objects(objects, opaque), self.colours(theta.detach()).to(
-            self.surrogate.dtype
-        )
+        return self.surrogate.with_objects(objects), self.colours(theta.detach()).to(self.surrogate.dtype)
 
     def camera_poses(self, states: Tensor) -> Array:
         """``T_world_from_camera [B, 4, 4]`` at car states ``[B, n]``, detached."""

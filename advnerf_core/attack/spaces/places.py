@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,6 +20,7 @@ from advnerf_core.attack.spaces.space import (
     NamedObject,
     Shown,
     SpaceError,
+    attacked_object,
     colours_of,
     require_same,
 )
@@ -54,7 +54,6 @@ class PlaceSpace:
     Args:
         surrogate: The scene with the objects where they stand without an attack.
         named: What attack files say of them, in their order.
-        budget: Placements that are drawn, and steps of each.
         mount: What shows the texture of one of them.
 
     Raises:
@@ -106,17 +105,7 @@ class PlaceSpace:
         """Each object at its place, with its colours."""
         colours = split_theta(self._fields, self.sensor.colours(theta).to(self.surrogate.dtype))
         rows = zip(self._named, placed(self._fields, self.sensor.placements(theta)), colours, strict=True)
-        return tuple(
-            AttackedObject(
-                named.name,
-                part.detach().numpy().astype(np.float32),
-                field.T_world_from_object,
-                field.scale,
-                named.sha256,
-                size_m=field.face_size_m,
-            )
-            for named, field, part in rows
-        )
+        return tuple(attacked_object(*row) for row in rows)
 
     def restored(self, attack: AttackFile) -> Shown:
         """The objects at the places of the file; see `Space.restored`."""

@@ -7,7 +7,7 @@ file, put into a deployment, or driven past in the learned scene.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -169,7 +169,6 @@ class ColourSpace:
     """Colours of objects with fixed places: voxels, faces, or textures of meshes.
 
     Args:
-        surrogate: The scene with the objects.
         named: What attack files say of them, in their order.
         light: What the camera sees of a painted colour, as measured, or of one that a monitor shows; None where it is seen as it is painted.
         cos_angle: Cosine of the angle at which the camera looks at a monitor; see `DisplayedSensor`.
@@ -211,7 +210,9 @@ class ColourSpace:
         rows = zip(
             self._named, self.surrogate.objects, split_theta(self.surrogate.objects, theta), strict=True
         )
-        return tuple(_attacked(named, field, part, _textured_glb(field, part)) for named, field, part in rows)
+        return tuple(
+            attacked_object(named, field, part, _textured_glb(field, part)) for named, field, part in rows
+        )
 
     def restored(self, attack: AttackFile) -> Shown:
         """The objects at their places, in the colours of the file; see `Space.restored`."""
@@ -224,11 +225,48 @@ class ColourSpace:
         return Shown(self.surrogate.objects, self._lit.seen_theta(painted).detach(), painted)
 
 
+class FaceSpace(ColourSpace):
+    """Colours of a face that hides its panel; without an attack the learned panel is seen.
+
+    Args:
+        surrogate: The scene with the face as its only object.
+        named: Entries of the face in attack files.
+        display: Optics of the screen and the room; None for a board, or for a screen that is assumed ideal.
+        cos_angle: Cosine of the angle at which the camera looks at a screen; see `DisplayedSensor`.
+    """
+
+    def __init__(
+        self,
+        surrogate: Surrogate,
+        named: NamedObject,
+        mount: FaceMount,
+        display: DisplayModel | None = None,
+        cos_angle: float = 1.0,
+    ) -> None:
+        if len(surrogate.objects) != 1:
+            raise ValueError(f"expected a surrogate with one face, got {len(surrogate.objects)} objects")
+        super().__init__(surrogate, [named], display, cos_angle, mount)
+
+    @property
+    def plain(self) -> Shown:
+        """The learned scene without the face."""
+        return Shown((), torch.zeros(0, 3, dtype=self.surrogate.dtype))
+
+    def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
+        """The shown colours; the size is that of the `AttackFace`."""
+        return tuple(replace(each, size_m=None) for each in super().attacked(theta))
+
+    def restored(self, attack: AttackFile) -> Shown:
+        """The face in the seen colours, behind the display if there is one; see `Space.restored`."""
+        found = super().restored(attack)
+        attack.required_face()
+        return replace(found, painted=None)
+
+
 class ShapeSpace:
     """Shapes of meshes in their own colours.
 
     Args:
-        surrogate: The scene with the meshes.
         named: Entries of the objects in attack files, in their order.
         limits: Largest displacement of vertices.
     """
@@ -261,7 +299,8 @@ class ShapeSpace:
         colours = split_theta(self.surrogate.objects, self.sensor.colours)
         rows = zip(self._named, self.sensor.shaped(theta), parts, colours, strict=True)
         return tuple(
-            _attacked(named, field, part, _textured_glb(field, colour)) for named, field, part, colour in rows
+            attacked_object(named, field, part, _textured_glb(field, colour))
+            for named, field, part, colour in rows
         )
 
     def restored(self, attack: AttackFile) -> Shown:
@@ -271,7 +310,10 @@ class ShapeSpace:
         return Shown(self.sensor.shaped(theta), self.sensor.colours)
 
 
-def _attacked(named: NamedObject, field: ColouredObject, part: Tensor, glb: bytes) -> AttackedObject:
+def attacked_object(
+    named: NamedObject, field: ColouredObject, part: Tensor, glb: bytes = b""
+) -> AttackedObject:
+    """An object of an attack file with its attacked parameters."""
     theta = part.detach().numpy().astype(np.float32)
     size_m = field.face_size_m if isinstance(field, VoxelGridObject) else None
     return AttackedObject(

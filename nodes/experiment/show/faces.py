@@ -9,8 +9,7 @@ from torch import Tensor
 
 from advnerf_core.attack.artifact import TEXTURE_PX, face_texture
 from advnerf_core.attack.projection import FaceOverlay
-from advnerf_core.attack.spaces.face import FaceSpace
-from advnerf_core.attack.spaces.space import FaceMount, NamedObject
+from advnerf_core.attack.spaces.space import FaceMount, FaceSpace, NamedObject
 from advnerf_core.display import DisplayModel
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.geometry import Array, invert_transform, make_transform, planar_pose, planar_poses

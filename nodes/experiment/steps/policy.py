@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
-from advnerf_core.attack.spaces.face import FaceSpace
+from advnerf_core.attack.spaces.space import FaceSpace
 from advnerf_core.data.image_files import write_image
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.view_loading import load_image
