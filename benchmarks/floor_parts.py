@@ -19,7 +19,7 @@ from advnerf_core.geometry import Array, Pinhole, make_transform, planar_poses
 from advnerf_core.parallel import SLOTS, run_slots, slot_bounds
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.view import PolicyView
-from advnerf_core.render.cast_object import cast_objects
+from advnerf_core.render.cast_object import cast_work
 from advnerf_core.render.march import Marcher, Samples
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
 from advnerf_core.scene.bake import bake
@@ -139,7 +139,7 @@ def tick_parts(batch: Batch, resolution: int) -> list[Part]:
     )
     rgb, depth_m = surrogate.scene_frames(pose)
     image = surrogate.render(pose, theta).images
-    casts = cast_objects([thing], pose, view)
+    casts = cast_work([thing], pose, view).run()
     weights = casts[0].weights
     background = least_work.baked_frame(
         *frame_samples(baked, trained.scene, pose, view),
@@ -152,7 +152,7 @@ def tick_parts(batch: Batch, resolution: int) -> list[Part]:
         Part("tick, background", lambda: surrogate.scene_frames(pose), background),
         Part(
             "tick, casting one object",
-            lambda: cast_objects([thing], pose, view),
+            lambda: cast_work([thing], pose, view).run(),
             least_work.casting(weights, density_bytes),
         ),
         Part(

@@ -24,7 +24,7 @@ from scipy import ndimage, sparse
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.sparse_rows import SparseRows
 from advnerf_core.fields.voxel_grid import VoxelGridObject
-from advnerf_core.geometry import Array, Pinhole, invert_transform, transform_points
+from advnerf_core.geometry import Array, Pinhole, invert_transform
 from advnerf_core.parallel import Work, scratch
 from advnerf_core.render.cast_kernels import FILLED, FOUND, box_windows, cast_window, reach_of_bricks
 from advnerf_core.render.occupancy import leap_distances
@@ -66,7 +66,7 @@ class CastsItself(Protocol):
     """An object with its own casting, other than a voxel grid."""
 
     def cast(self, T_world_from_camera: Array, pinhole: Pinhole, supersample: int, dtype: Any) -> ObjectCast:
-        """Cast into cameras ``[B, 4, 4]``; see :func:`cast_objects`."""
+        """Cast into cameras ``[B, 4, 4]``; see :func:`cast_work`."""
 
 
 def cast_object(
@@ -76,29 +76,8 @@ def cast_object(
     supersample: int = 2,
     dtype: Any = np.float32,
 ) -> ObjectCast:
-    """Cast an object into a batch of cameras; see :func:`cast_objects`."""
-    return cast_objects([field], T_world_from_camera, pinhole, supersample, dtype)[0]
-
-
-def cast_objects(
-    fields: Sequence[ColouredObject],
-    T_world_from_camera: ArrayLike,
-    pinhole: Pinhole,
-    supersample: int = 2,
-    dtype: Any = np.float32,
-) -> list[ObjectCast]:
-    """Cast objects into a batch of cameras, on all threads; each pixel's result does not depend on the others.
-
-    Args:
-        T_world_from_camera: Camera poses ``[B, 4, 4]``, OpenCV axes; one that is not finite sees nothing.
-        pinhole: Intrinsics of all of them.
-        supersample: Rays along each side of a pixel.
-        dtype: Type of the weights, float32 or float64; geometry is always float64.
-
-    Raises:
-        ValueError: No rays.
-    """
-    return cast_work(fields, T_world_from_camera, pinhole, supersample, dtype).run()
+    """Cast an object into a batch of cameras; see :func:`cast_work`."""
+    return cast_work([field], T_world_from_camera, pinhole, supersample, dtype).run()[0]
 
 
 def cast_work(
@@ -108,7 +87,16 @@ def cast_work(
     supersample: int = 2,
     dtype: Any = np.float32,
 ) -> Work[list[ObjectCast]]:
-    """:func:`cast_objects` as work that has not begun: its parts may run beside other work's."""
+    """The casting of objects into a batch of cameras, not begun yet; each pixel's result does not depend on the others.
+
+    Args:
+        T_world_from_camera: Camera poses ``[B, 4, 4]``, OpenCV axes; one that is not finite sees nothing.
+        supersample: Rays along each side of a pixel.
+        dtype: Type of the weights, float32 or float64; geometry is always float64.
+
+    Raises:
+        ValueError: No rays.
+    """
     poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
     if supersample < 1:
         raise ValueError(f"expected at least 1 ray along a pixel's side, got {supersample}")
@@ -368,8 +356,3 @@ def windows(field: VoxelGridObject, T_camera_from_world: Array, pinhole: Pinhole
     intrinsics = np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy])
     box = field.scale * np.stack([grids.low, grids.high])
     return box_windows(T_camera_from_object, box, intrinsics, pinhole.width, pinhole.height)
-
-
-def transform_corners(T_world_from_camera: Array, points_in_world: Array) -> Array:
-    """Points ``[N, 3]`` of the world in each of ``[B]`` cameras, ``[B, N, 3]``."""
-    return np.stack([transform_points(T, points_in_world) for T in invert_transform(T_world_from_camera)])

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from advnerf_core.errors import DeviceError
@@ -46,27 +45,6 @@ def voxel_edges(field: VoxelGridObject) -> Array:
     """Object units per voxel along each axis ``[3]``."""
     edges: Array = (np.asarray(field.box_max, np.float64) - field.box_min) / field.slots.shape
     return edges
-
-
-def object_places(
-    objects: Sequence[VoxelGridObject], T_world_from_camera: Array, pinhole: Pinhole
-) -> tuple[Array, NDArray[np.int32]]:
-    """Places of objects for cameras ``[B, 4, 4]``.
-
-    Returns:
-        Directions of unit planar depth in each camera to voxel coordinates, row by row, then the camera's centre there ``[K, B, 12]``; and
-        first row, end row, first column, end column of the pixels that may show each object ``[K, B, 4]``.
-    """
-    T_camera_from_world = invert_transform(T_world_from_camera)
-    frames = np.empty((len(objects), len(T_world_from_camera), 12))
-    seen = np.empty((*frames.shape[:2], 4), np.int32)
-    for k, field in enumerate(objects):
-        edges = voxel_edges(field)
-        T = invert_transform(field.T_world_from_object) @ T_world_from_camera
-        frames[k, :, :9] = (T[:, :3, :3] / field.scale / edges[:, None]).reshape(-1, 9)
-        frames[k, :, 9:] = (T[:, :3, 3] / field.scale - field.box_min) / edges - 0.5
-        seen[k] = windows(field, T_camera_from_world, pinhole)
-    return frames, seen
 
 
 def sum_of_slopes(slopes: Tensor, pull: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
@@ -103,12 +81,7 @@ class SeenSamples(NamedTuple):
 
 
 class TorchGrid:
-    """The voxels of one object on a device.
-
-    Args:
-        field: The object.
-        dtype: Type of its densities.
-    """
+    """The voxels of one object on a device."""
 
     def __init__(self, field: VoxelGridObject, dtype: torch.dtype, device: torch.device) -> None:
         grids = prepared(field, torch.empty(0, dtype=dtype).numpy().dtype)
@@ -205,7 +178,6 @@ class TorchObjects:
 
     Args:
         objects: At least one, all voxel grids.
-        pinhole: Camera of all images.
         supersample: Rays along each side of a pixel.
         dtype: Type of densities and images; geometry is float64 in any case.
         tolerance_m: Distance behind the background at which an object is still visible [m].
@@ -222,8 +194,21 @@ class TorchObjects:
         self._first = np.cumsum([0, *(field.slot_count for field in self.objects)]).tolist()
 
     def placed(self, T_world_from_camera: Array) -> tuple[Tensor, Tensor]:
-        """Places of the objects for cameras ``[B, 4, 4]``, see `object_places`."""
-        frames, seen = object_places(self.objects, T_world_from_camera, self._pinhole)
+        """Places of the objects for cameras ``[B, 4, 4]``.
+
+        Returns:
+            Directions of unit planar depth in each camera to voxel coordinates, row by row, then the camera's centre there ``[K, B, 12]``;
+            and first row, end row, first column, end column of the pixels that may show each object ``[K, B, 4]``.
+        """
+        T_camera_from_world = invert_transform(T_world_from_camera)
+        frames = np.empty((len(self.objects), len(T_world_from_camera), 12))
+        seen = np.empty((*frames.shape[:2], 4), np.int32)
+        for k, field in enumerate(self.objects):
+            edges = voxel_edges(field)
+            T = invert_transform(field.T_world_from_object) @ T_world_from_camera
+            frames[k, :, :9] = (T[:, :3, :3] / field.scale / edges[:, None]).reshape(-1, 9)
+            frames[k, :, 9:] = (T[:, :3, 3] / field.scale - field.box_min) / edges - 0.5
+            seen[k] = windows(field, T_camera_from_world, self._pinhole)
         return torch.from_numpy(frames).to(self.device), torch.from_numpy(seen).to(self.device)
 
     def draw(self, places: tuple[Tensor, Tensor], colours: Tensor, texture_of: Tensor, behind_m: Tensor,
@@ -231,7 +216,6 @@ class TorchObjects:
         """Draw into ``image [B, 3, H, W]``, a background of planar depth ``behind_m [B, H, W]``.
 
         Args:
-            places: From `placed`.
             colours: All objects' colour vectors in their order, for each texture ``[N, V, 3]``.
             texture_of: Index of each image's texture ``[B]`` int32.
             behind_m: Planar depth of the background ``[B, H, W]`` [m].

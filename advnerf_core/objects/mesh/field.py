@@ -17,11 +17,11 @@ from torch import Tensor
 
 from advnerf_core.fields.sparse_rows import SparseRows
 from advnerf_core.fields.voxel_grid import inverse_squash, squash
-from advnerf_core.geometry import Array, Pinhole, invert_transform
+from advnerf_core.geometry import Array, Pinhole, invert_transform, transform_points
 from advnerf_core.objects.mesh.ray_cast import Hits, RayCaster
 from advnerf_core.objects.mesh.surface import TexturedMesh
 from advnerf_core.render.cast_kernels import NEAR_M
-from advnerf_core.render.cast_object import ObjectCast, transform_corners
+from advnerf_core.render.cast_object import ObjectCast
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,9 @@ class MeshField:
         low, high = self.mesh.box
         unit = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
         corners = self.scale * (low + unit * (high - low)) @ self.T_world_from_object[:3, :3].T
-        seen = transform_corners(T_world_from_camera[None], corners + self.T_world_from_object[:3, 3])[0]
+        seen = transform_points(
+            invert_transform(T_world_from_camera), corners + self.T_world_from_object[:3, 3]
+        )
         if not (seen[:, 2] > NEAR_M).any():
             return None
         if not (seen[:, 2] > NEAR_M).all():

@@ -7,7 +7,7 @@ import torch
 
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, squash
 from advnerf_core.geometry import Pinhole, invert_transform, look_at, make_transform, rotation_z
-from advnerf_core.render.cast_object import cast_object, cast_objects, made_opaque, windows
+from advnerf_core.render.cast_object import cast_object, cast_work, made_opaque, windows
 
 PINHOLE = Pinhole(80, 60, 60.0, 61.0, 40.0, 29.0)
 
@@ -327,7 +327,7 @@ def test_several_objects_and_threads_give_what_each_gives_alone():
     ]
     poses = np.stack([camera_toward(azimuth) for azimuth in (0.3, 1.7)])
     for dtype in (np.float32, np.float64):
-        together = cast_objects(fields, poses, PINHOLE, 2, dtype)
+        together = cast_work(fields, poses, PINHOLE, 2, dtype).run()
         for field, cast in zip(fields, together, strict=True):
             for b in range(2):
                 single = cast_object(field, poses[b : b + 1], PINHOLE, 2, dtype)
