@@ -52,7 +52,6 @@ class DeviceFrames:
     """A batch of camera poses with everything that does not depend on ``theta``.
 
     Attributes:
-        surrogate: The surrogate that renders them.
         background: Background ``[B, 3, H, W]`` on the device.
         depth_m: Planar depth of the background ``[B, H, W]`` [m].
         places: Places of the objects, from `TorchObjects.placed`; None without objects.
@@ -97,7 +96,6 @@ class DeviceSurrogate:
 
     Args:
         surrogate: The scene with its objects, all voxel grids.
-        device: Where it computes.
 
     Raises:
         DeviceError: The objects are not all voxel grids, or composed opaque.

@@ -6,33 +6,13 @@ scene is rendered and the objects are cast for all of them at once, and only the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
-
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from advnerf_core.geometry import Array
-from advnerf_core.scene.surrogate import PoseBatch, Rendered, Surrogate, split_theta
-
-
-@dataclass(frozen=True, eq=False)
-class _Share:
-    """The part of a batch for one texture: rows of one object's weights, and their pixels."""
-
-    rows: NDArray[np.int64]
-    pixels: Tensor
-
-
-@runtime_checkable
-class ShowsMany(Protocol):
-    """A sensor with its own support for several textures at once."""
-
-    def many(self, count: int, starts: int) -> Any:
-        """The sensor for ``count`` textures at once, each from ``starts`` starts; frames and theta as in `ManyTextures`."""
+from advnerf_core.scene.surrogate import PoseBatch, Rendered, Surrogate
 
 
 class ManyTextures:
@@ -40,10 +20,6 @@ class ManyTextures:
 
     Frames come ordered by tick, then by texture, then by start: image ``i`` of a batch shows texture
     ``(i // starts) % count``. Its ``theta`` is the textures stacked, ``[count, *surrogate.theta_shape]``.
-
-    Args:
-        surrogate: The scene with its objects.
-        starts: Number of start poses of each.
     """
 
     def __init__(self, surrogate: Surrogate, count: int, starts: int) -> None:
@@ -79,54 +55,19 @@ class ManyTextures:
         return self._shown(self._surrogate.prepare(poses), theta.detach())
 
     def _shown(self, frames: PoseBatch, theta: Tensor) -> Rendered:
-        image = frames.background.numpy().copy()
-        shares = [self._shares(pixels, frames.background.shape) for pixels in frames.pixels]
-        values: list[list[Tensor]] = []
-        for k in range(self.count):
-            parts = split_theta([seen.field for seen in frames.seen], theta[k])
-            values.append(
-                [
-                    seen.values(part.to(frames.background.dtype))
-                    for seen, part in zip(frames.seen, parts, strict=True)
-                ]
-            )
-            for seen, W, share, value in zip(frames.seen, frames.weights, shares, values[k], strict=True):
-                rows, pixels = W.take(share[k].rows), share[k].pixels.numpy()
-                rows.add_product(seen.colours(value).numpy(), pixels, image.reshape(-1, 3))
-        images = torch.from_numpy(np.ascontiguousarray(image.transpose(0, 3, 1, 2)))
-        kept = sum(value.nbytes for each in values for value in each) + sum(
-            seen.nbytes for seen in frames.seen
-        )
-        own = sum(share.rows.nbytes + share.pixels.nbytes for each in shares for share in each)
-        nbytes = int(images.nbytes + kept + own + frames.weights_nbytes)
-        return Rendered(images, _vjp(frames, shares, values, theta), nbytes)
+        count, height, width, _ = frames.background.shape
+        texture = np.arange(count) // self.starts % self.count
+        chosen = [np.flatnonzero(texture == k) for k in range(self.count)]
+        parts = [frames.only(some).render(theta[k]) for k, some in enumerate(chosen)]
+        images = torch.empty(count, 3, height, width, dtype=frames.background.dtype)
+        for some, part in zip(chosen, parts, strict=True):
+            images[some] = part.images
+        nbytes = images.nbytes + sum(part.nbytes - part.images.nbytes for part in parts)
+        # Only these names are kept alive: the images of the parts are not, nor are the textures.
+        vjps, shape = [part.vjp for part in parts], theta.shape
 
-    def _shares(self, pixels: Tensor, shape: Sequence[int]) -> list[_Share]:
-        """Assign an object's pixels to textures."""
-        flat = pixels.numpy()
-        texture = (flat // (shape[1] * shape[2]) // self.starts) % self.count
-        rows = [np.flatnonzero(texture == k) for k in range(self.count)]
-        return [_Share(each, pixels[torch.from_numpy(each)]) for each in rows]
+        def vjp(grad_images: Tensor) -> Tensor:
+            rows = [part(grad_images[some]) for some, part in zip(chosen, vjps, strict=True)]
+            return torch.stack(rows).reshape(shape)
 
-
-def _vjp(
-    frames: PoseBatch, shares: Sequence[Sequence[_Share]], values: Sequence[Sequence[Tensor]], theta: Tensor
-) -> Callable[[Tensor], Tensor]:
-    # Only these names are kept alive: the background is not, nor are the textures.
-    weights, seen, dtype, shape = frames.weights, frames.seen, theta.dtype, theta.shape
-
-    def vjp(grad_images: Tensor) -> Tensor:
-        flat = grad_images.detach().permute(0, 2, 3, 1).reshape(-1, 3)
-        gradient = []
-        for k in range(shape[0]):
-            rows = [
-                here.gradient(
-                    value,
-                    torch.from_numpy(W.take(share[k].rows).transposed_product(flat[share[k].pixels].numpy())),
-                )
-                for here, value, W, share in zip(seen, values[k], weights, shares, strict=True)
-            ]
-            gradient.append(torch.cat(rows).to(dtype) if rows else torch.zeros(0, 3, dtype=dtype))
-        return torch.stack(gradient).reshape(shape)
-
-    return vjp
+        return Rendered(images, vjp, nbytes)

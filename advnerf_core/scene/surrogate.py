@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from advnerf_core.fields.coloured import ColouredObject
@@ -84,6 +84,20 @@ class PoseBatch:
         )  # in memory a pixel's channels stay together, as convolutions take them
         own = sum(rows.nbytes for rows in self.seen) + sum(value.nbytes for value in values)
         return Rendered(images, self._vjp(theta, values), images.nbytes + self.weights_nbytes + own)
+
+    def only(self, images: NDArray[np.int64]) -> PoseBatch:
+        """The batch of some of its images, by their numbers."""
+        size = self.background[0, :, :, 0].numel()
+        place = np.full(len(self.background), -1)
+        place[images] = np.arange(len(images))
+        places = [place[flat.numpy() // size] for flat in self.pixels]
+        kept = [np.flatnonzero(found >= 0) for found in places]
+        pixels = tuple(
+            flat[rows] % size + size * torch.from_numpy(found[rows])
+            for flat, found, rows in zip(self.pixels, places, kept, strict=True)
+        )
+        weights = tuple(W.take(rows) for W, rows in zip(self.weights, kept, strict=True))
+        return PoseBatch(self.background[images], weights, pixels, self.seen)
 
     @property
     def weights_nbytes(self) -> int:

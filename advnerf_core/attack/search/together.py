@@ -29,7 +29,8 @@ from advnerf_core.attack.search.search import (
     search_fingerprint,
 )
 from advnerf_core.files import read_tensors, write_atomically
-from advnerf_core.scene.many_textures import ManyTextures, ShowsMany
+from advnerf_core.scene.device_surrogate import DeviceSurrogate
+from advnerf_core.scene.many_textures import ManyTextures
 from advnerf_core.scene.surrogate import Surrogate
 
 _FORMAT = "advnerf-searches-1"
@@ -77,9 +78,8 @@ def _many(sensor: Sensor, count: int, starts: int) -> Sensor:
     """The sensor for several textures at once."""
     if isinstance(sensor, Surrogate):
         return ManyTextures(sensor, count, starts)
-    if isinstance(sensor, ShowsMany):
-        shown: Sensor = sensor.many(count, starts)
-        return shown
+    if isinstance(sensor, DeviceSurrogate):
+        return sensor.many(count, starts)
     raise TypeError(f"expected problems with a Surrogate as sensor, got {type(sensor).__name__}")
 
 

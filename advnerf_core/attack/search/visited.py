@@ -7,7 +7,6 @@ from the same places keeps them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -15,19 +14,8 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import RenderCache
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.driving.rollout import Rollout, drive
-from advnerf_core.geometry import Array
-from advnerf_core.scene.surrogate import PoseBatch, Rendered
-
-
-@runtime_checkable
-class PreparingSensor(Protocol):
-    """A sensor whose frames can be kept without their colours, such as a ``Surrogate``."""
-
-    def camera_poses(self, states: Tensor) -> Array:
-        """``T_world_from_camera [B, 4, 4]``."""
-
-    def prepare(self, T_world_from_camera: Array) -> PoseBatch:
-        """Everything of these frames that does not depend on theta."""
+from advnerf_core.scene.device_surrogate import DeviceFrames, DeviceSurrogate
+from advnerf_core.scene.surrogate import PoseBatch, Rendered, Surrogate
 
 
 class Visited:
@@ -36,14 +24,13 @@ class Visited:
     A disturbed problem, or a sensor that cannot keep frames, renders each time again: the same images, more slowly.
 
     Args:
-        ticks: Numbers of the ticks.
         states: ``[ticks * B, n]``, ordered by tick.
     """
 
     def __init__(self, problem: AttackProblem, ticks: Sequence[int], states: Tensor) -> None:
         self._problem, self._ticks, self._states = problem, tuple(ticks), states.clone()
-        self._frames: PoseBatch | None = None
-        if problem.disturbances is None and isinstance(problem.sensor, PreparingSensor):
+        self._frames: PoseBatch | DeviceFrames | None = None
+        if problem.disturbances is None and isinstance(problem.sensor, Surrogate | DeviceSurrogate):
             self._frames = problem.sensor.prepare(problem.sensor.camera_poses(states))
 
     @property

@@ -19,10 +19,10 @@ from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.population import population_search
 from advnerf_core.attack.search.query_count import CountedPolicy, VictimError, calls_per_evaluation
 from advnerf_core.attack.search.search import SearchStateError
-from advnerf_core.attack.search.visited import PreparingSensor, VisitedDrive
+from advnerf_core.attack.search.visited import VisitedDrive
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Path
-from advnerf_core.scene.surrogate import Rendered
+from advnerf_core.scene.surrogate import Rendered, Surrogate
 from tests.support.attack_toy import toy_problem
 
 STEPS, EDGE = 8, 8
@@ -221,7 +221,7 @@ def test_what_is_kept_of_rendered_frames_changes_nothing():
             problem.sensor.sense,
         )
 
-    assert isinstance(problem.sensor, PreparingSensor)
+    assert isinstance(problem.sensor, Surrogate)
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(0))
     others = [problem, replace(problem, cache_bytes=0), replace(problem, sensor=Plain())]
     seen = [VisitedDrive(each, theta).images(theta + 1.0) for each in others]
