@@ -20,14 +20,17 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from advnerf_core.attack.packed import PACKED_FORMAT, packed, unpacked
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import read_tensors, write_tensors
 from advnerf_core.geometry import Array, Pinhole, yaw_of
 
 FILE_FORMAT = "advnerf-attack-2"
+# The published form, a fortieth of the size: without derived data, the displayed texture of a face, and with theta in half precision where
+# that is exact. The attack file is restored from it to the bit.
+PACKED_FORMAT = "advnerf-attack-2-packed"
 TEXTURE_PX = 512
+_TEXTURE = "face.texture"
 
 # The spaces that a search can change.
 COLOURS, PLACES, MESH_TEXTURE, MESH_SHAPE = "colours", "places", "mesh_texture", "mesh_shape"
@@ -215,7 +218,7 @@ class AttackFile:
             if each.glb:
                 found[f"objects.{k}.glb"] = np.frombuffer(each.glb, np.uint8)
         if self.face is not None:
-            found["face.texture"] = np.ascontiguousarray(self.face.texture)
+            found[_TEXTURE] = np.ascontiguousarray(self.face.texture)
         return found
 
     def _metadata(self) -> dict[str, Any]:
@@ -271,15 +274,40 @@ def save_attack(path: str | os.PathLike[str], attack: AttackFile, small: bool = 
     """Write an attack file atomically and return its id.
 
     Args:
-        small: Leave out derived tensors, see `advnerf_core.attack.packed`; `load_attack` reads both.
+        small: Leave out derived tensors; `load_attack` restores them.
     """
     header = {"format": FILE_FORMAT, "sha256": attack.sha256, "metadata": _canonical(attack._metadata())}
     tensors = attack._tensors()
     if small:
         header["format"] = PACKED_FORMAT
-        tensors = packed(tensors, attack.face.carried_by if attack.face else None, face_texture)
+        tensors = _packed(tensors, attack.face.carried_by if attack.face else None)
     write_tensors(path, "numpy", tensors, header)
     return attack.attack_id
+
+
+def _packed(tensors: dict[str, NDArray[Any]], carried_by: int | None) -> dict[str, NDArray[Any]]:
+    """The tensors without the derived ones; ``carried_by`` is the number of the object with the face."""
+    found = {name: _narrowed(each) if name.endswith(".theta") else each for name, each in tensors.items()}
+    if carried_by is not None:
+        theta = tensors[f"objects.{carried_by}.theta"]
+        if np.array_equal(tensors[_TEXTURE], face_texture(theta)):
+            del found[_TEXTURE]
+    return found
+
+
+def _unpacked(tensors: dict[str, NDArray[Any]], carried_by: int | None) -> dict[str, NDArray[Any]]:
+    found = {
+        name: each.astype(np.float32) if name.endswith(".theta") else each for name, each in tensors.items()
+    }
+    if carried_by is not None and _TEXTURE not in found:
+        found[_TEXTURE] = face_texture(found[f"objects.{carried_by}.theta"])
+    return found
+
+
+def _narrowed(theta: NDArray[Any]) -> NDArray[Any]:
+    with np.errstate(over="ignore"):
+        half = theta.astype(np.float16)
+    return half if np.array_equal(half.astype(np.float32), theta) else theta
 
 
 def load_attack(path: str | os.PathLike[str]) -> AttackFile:
@@ -321,7 +349,7 @@ def _checked(header: dict[str, Any], tensors: dict[str, NDArray[Any]], source: s
         metadata = json.loads(header["metadata"])
         if header["format"] == PACKED_FORMAT:
             face = metadata["face"]
-            tensors = unpacked(tensors, None if face is None else face["carried_by"], face_texture)
+            tensors = _unpacked(tensors, None if face is None else face["carried_by"])
         attack = _from_parts(metadata, tensors)
     except AttackFileError:
         raise
@@ -354,7 +382,7 @@ def _from_parts(metadata: dict[str, Any], tensors: dict[str, NDArray[Any]]) -> A
     if face is not None:
         corners = np.array(face["corners_in_subject"])
         values["face"] = AttackFace(
-            tensors["face.texture"], tuple(face["size_m"]), face["subject"], corners, face["carried_by"]
+            tensors[_TEXTURE], tuple(face["size_m"]), face["subject"], corners, face["carried_by"]
         )
     return AttackFile(**values)
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +19,41 @@ from safetensors.numpy import save as save_arrays
 from advnerf_core.data.views import ImageSet
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import read_tensors, write_atomically
-from advnerf_core.render.march import Marcher, Samples
+from advnerf_core.render.march import MarchConfig, Marcher, Samples
 from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances, refine_occupied
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
 from advnerf_core.scene.exposure import Exposures, RayGains
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
-from advnerf_core.scene.fingerprint import training_fingerprint
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.torch_step import TorchStep
 from advnerf_core.scene.train_config import TrainConfig, TrainedScene, TrainingReport
 from advnerf_core.scene.train_step import CpuStep, Matte, StepResult
 
 Array32 = NDArray[np.float32]
+# Settings that older checkpoints do not have, with their neutral values.
+_LATER = {"exposure": False, "decay": "exponential"}
+
+
+def training_fingerprint(
+    images: ImageSet, field: SceneFieldConfig, config: TrainConfig, march: MarchConfig
+) -> str:
+    """Hash of a training's images and settings, 16 hexadecimal digits: a checkpoint can only be resumed with the same.
+
+    Args:
+        march: The chosen intervals, which also depend on the cameras and on the rule.
+    """
+    training = {**asdict(config), "march": asdict(march)}
+    for name, usual in _LATER.items():
+        if training[name] == usual:
+            del training[name]
+    digest = hashlib.sha256(json.dumps([field.to_dict(), training], sort_keys=True).encode())
+    digest.update(str(images.rgb.shape).encode() + images.T_world_from_camera.tobytes())
+    digest.update(images.rgb[:, ::16, ::16].tobytes())
+    if images.alpha is not None and not field.learned_background:
+        digest.update(images.alpha[:, ::16, ::16].tobytes())
+    if images.valid is not None:
+        digest.update(np.flatnonzero(images.valid).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def stepper_for(scene: SceneField, config: TrainConfig) -> CpuStep | TorchStep:
