@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
-from advnerf_core.attack.search.student_options import StudentOptions
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.plugins import (
     PluginError,
@@ -31,6 +30,7 @@ from advnerf_core.plugins import (
     require_known,
     resolve,
 )
+from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
 from advnerf_core.report.conditions import CONDITIONS
 
 if TYPE_CHECKING:
@@ -74,6 +74,29 @@ class SearchSettings:
     gradient_rate: float = 0.1
     random_sigma: float = 5.0
     options: Any = None
+
+
+@dataclass(frozen=True)
+class StudentOptions:
+    """Options of the methods ``distilled`` and ``guided``.
+
+    Attributes:
+        student: Architecture of the student: a name, or ``file.py:Class`` relative to the working folder.
+    """
+
+    student: str = PILOTNET
+    configuration: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        try:
+            require_architecture(self.student, None, self.configuration)
+        except AdvnerfError as error:
+            raise ValueError(str(error)) from None
+
+    @property
+    def architecture(self) -> Architecture:
+        """The architecture with its settings."""
+        return Architecture(self.student, self.configuration)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +192,7 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "cem": Method(_late("cem")),
         "evolution": Method(_late("evolution")),
         "gradient": Method(_late("gradient"), needs_gradient=True, reads_scale=True),
-        "gradient_coarse": Method(_late("gradient_coarse"), needs_gradient=True),
+        "gradient_coarse": Method(_late("gradient", "search_coarse"), needs_gradient=True),
         "frame": Method(_late("frame"), needs_gradient=True, single_images=True),
         "guided": Method(
             _late("black_box", "search_as", "guided"),
@@ -208,10 +231,6 @@ def load_method(reference: str, folder: Path | None = None) -> Method:
 
 def require_method(reference: str, folder: Path | None = None) -> None:
     """Raise unless a reference names a method; nothing is loaded.
-
-    Args:
-        reference: See `load_method`.
-        folder: See `load_method`.
 
     Raises:
         PluginError: The method is unknown, or its name is ambiguous.

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from advnerf_core.plugins import (
     PluginError,
     code_sha256,
-    known_names,
     name_in_results,
     require_known,
     resolve,
@@ -66,10 +65,6 @@ def load_objective(reference: str, folder: Path | None = None) -> Objective:
 def require_objective(reference: str, folder: Path | None = None) -> None:
     """Raise unless a reference names an objective; nothing is loaded.
 
-    Args:
-        reference: See `load_objective`.
-        folder: See `load_objective`.
-
     Raises:
         PluginError: The objective is unknown, or it has the name of a built-in one.
     """
@@ -92,11 +87,6 @@ def objective_entry(reference: str, objective: Objective, value: float) -> dict[
     if reference == CTE:
         return {}
     return {"objective": {"name": name_in_results(reference), "unit": objective.unit, "value": value}}
-
-
-def objective_names() -> tuple[str, ...]:
-    """Names of the built-in objectives, then of objectives in installed packages."""
-    return known_names(OBJECTIVES, GROUP)
 
 
 def _row(name: str) -> Callable[[], Any]:

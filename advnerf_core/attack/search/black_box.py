@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AdjointResult, gradient_pass
-from advnerf_core.attack.methods import FRESH_RUN, SearchRun, SearchSettings
+from advnerf_core.attack.methods import FRESH_RUN, SearchRun, SearchSettings, StudentOptions
 from advnerf_core.attack.problem import AttackProblem, SearchDivergedError
 from advnerf_core.attack.search.distil import (
     ArchitectureStudent,
@@ -37,7 +37,6 @@ from advnerf_core.attack.search.distil import (
     Lessons,
     Student,
     StudentFactory,
-    pilotnet_student,
     to_bytes,
 )
 from advnerf_core.attack.search.population import Coarse
@@ -50,7 +49,6 @@ from advnerf_core.attack.search.search import (
     require_finite,
     search_fingerprint,
 )
-from advnerf_core.attack.search.student_options import StudentOptions
 from advnerf_core.attack.search.visited import Visited, VisitedDrive
 from advnerf_core.errors import AdvnerfError
 
@@ -70,11 +68,9 @@ class BlackBoxSearch:
     """Settings of an attack on a policy without a gradient.
 
     Attributes:
-        method: See the module's docstring.
         probes: Antithetic pairs of textures queried at every visited frame, after every drive. ``distilled`` uses them as lessons only.
         probe_sigma: Root mean square of a probe's change of theta.
         cells: Cells along an edge of the random textures; see `Coarse`.
-        student: Makes the student.
     """
 
     method: Method = "guided"
@@ -83,7 +79,7 @@ class BlackBoxSearch:
     probe_sigma: float = 0.1
     cells: int = 8
     distillation: Distillation = field(default_factory=Distillation)
-    student: StudentFactory = pilotnet_student
+    student: StudentFactory = field(default_factory=ArchitectureStudent)
 
     def __post_init__(self) -> None:
         if self.probes < 1 or self.learning_rate <= 0.0 or self.probe_sigma <= 0.0:
@@ -130,11 +126,8 @@ class BlackBoxSearch:
     def settings(self) -> str:
         """Settings that must be the same when a search is resumed."""
         student = self.student
-        if isinstance(student, ArchitectureStudent):
-            name = student.name
-        else:
-            name = getattr(student, "__qualname__", type(student).__name__)
-        return repr(replace(self, student=pilotnet_student)).replace(repr(pilotnet_student), name)
+        name = student.name if isinstance(student, ArchitectureStudent) else type(student).__name__
+        return repr(self).replace(repr(student), name)
 
 
 def black_box_attack(
@@ -147,7 +140,6 @@ def black_box_attack(
 
     Args:
         problem: The attack problem; its policy is only queried for steering, even if it has a gradient.
-        search: Method and settings.
         calls: Total policy calls (images), including a resumed state's; never exceeded.
         run: Seed of the start, the student and the probes, state file and callback; a search resumes from its state file to the bit.
 
@@ -193,15 +185,13 @@ def planned_evaluations(method: Method, problem: AttackProblem, settings: Search
 def _asked(method: Method, settings: SearchSettings) -> BlackBoxSearch:
     lessons = Distillation() if settings.warm_pairs is None else Distillation(warm_pairs=settings.warm_pairs)
     options = settings.options or StudentOptions()
-    # The default keeps its name from the state files of interrupted searches.
-    default = options == StudentOptions()
     return BlackBoxSearch.usual(
         method,
         settings.learning_rate,
         settings.probes,
         cells=settings.cells,
         distillation=lessons,
-        student=pilotnet_student if default else ArchitectureStudent(options.architecture),
+        student=ArchitectureStudent(options.architecture),
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from advnerf_core.adam import Adam
 from advnerf_core.policies.architecture import Architecture
 from advnerf_core.policies.network import SteeringNetwork
-from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
 
 StudentFactory = Callable[[tuple[int, ...], int, float], nn.Module]
@@ -92,29 +91,21 @@ class Resized(nn.Module):
 
 @dataclass(frozen=True)
 class ArchitectureStudent:
-    """Makes students of any architecture.
+    """Makes students of an architecture; by default an unknown victim is assumed to resemble the usual policies of this field."""
 
-    Attributes:
-        architecture: The architecture with its settings.
-    """
-
-    architecture: Architecture
+    architecture: Architecture = field(default_factory=Architecture)
 
     @property
     def name(self) -> str:
-        """Name that must be the same when a search is resumed."""
+        """Name that must be the same when a search is resumed; state files of interrupted searches have that of the default."""
+        if self == ArchitectureStudent():
+            return "pilotnet_student"
         return json.dumps(self.architecture.described(), sort_keys=True)
 
     def __call__(self, image_shape: tuple[int, ...], goal_size: int, bound_rad: float) -> nn.Module:
         """A network for images of any size ``[3, H, W]``."""
         del image_shape
         return Resized(self.architecture.build(goal_size, bound_rad))
-
-
-def pilotnet_student(image_shape: tuple[int, ...], goal_size: int, bound_rad: float) -> nn.Module:
-    """The default student: an unknown victim is assumed to resemble the usual policies of this field."""
-    del image_shape  # any size is resized
-    return Resized(PilotNet(goal_size, bound_rad))
 
 
 @dataclass
@@ -161,7 +152,6 @@ class Student:
     """A network, its optimiser and its lessons; its whole state is in tensors.
 
     Args:
-        factory: Makes the network.
         bound_rad: Bound of its steering [rad]; twice the greatest answer of the first lessons if None.
 
     Attributes:
@@ -177,7 +167,7 @@ class Student:
         lessons: Lessons,
         settings: Distillation,
         seed: int,
-        factory: StudentFactory = pilotnet_student,
+        factory: StudentFactory,
         bound_rad: float | None = None,
     ) -> None:
         self.lessons, self.settings = lessons, settings
@@ -239,7 +229,7 @@ class Student:
 
     @classmethod
     def from_tensors(
-        cls, tensors: dict[str, Tensor], settings: Distillation, factory: StudentFactory = pilotnet_student
+        cls, tensors: dict[str, Tensor], settings: Distillation, factory: StudentFactory
     ) -> Student:
         """Restore a student from its `tensors`."""
         kept = {

@@ -1,4 +1,8 @@
-"""The method ``gradient``: Adam on the grid values, with the gradient from the discrete adjoint over several start poses."""
+"""The method ``gradient``: Adam on the grid values, with the gradient from the discrete adjoint over several start poses.
+
+``gradient_coarse`` is the same in the coarse textures that ``cem`` and ``evolution`` search. It separates the value of the gradient from the
+value of the finer texture: same parameters, same evaluations, other steps.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +26,33 @@ from advnerf_core.attack.search.search import (
     require_finite,
     search_fingerprint,
 )
+from advnerf_core.errors import AdvnerfError
+
+
+class NoFinerFaceError(AdvnerfError, ValueError):
+    """The object is not finer than the coarse texture."""
 
 
 def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
     """The method; see `advnerf_core.attack.methods`."""
     return gradient_attack(problem, settings.evaluations, gradient_step(problem, settings), run)
+
+
+def search_coarse(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    """The method ``gradient_coarse``.
+
+    Raises:
+        NoFinerFaceError: The object is not a single face, or has no more cells than the coarse texture.
+    """
+    problem.coloured("gradient_coarse")
+    shape, cells = tuple(problem.sensor.theta_shape), settings.cells
+    if Coarse(shape, cells).shape == shape:
+        raise NoFinerFaceError(
+            f"expected one face of more than {cells} x {cells} cells for the method gradient_coarse, got colours of shape {shape}; "
+            "use the method gradient"
+        )
+    rate = gradient_step(problem, settings)
+    return climb(problem, adjoint_slope, settings.evaluations, rate, run, cells, method="gradient_coarse")
 
 
 def gradient_attack(

@@ -31,7 +31,6 @@ class Coarse:
     """A coarse texture on a face, interpolated bilinearly to theta; objects other than a single face keep all their colours.
 
     Attributes:
-        theta_shape: Shape of theta.
         cells: Cells along an edge; 0, or as many as the face has, searches theta itself.
     """
 
@@ -103,7 +102,6 @@ def population_search(
         strategy: Distribution of candidates, such as `cem.CrossEntropy` or `evolution.Evolution`.
         evaluations: Total rollouts, including a resumed state's; a last generation may stay unfinished.
         population: Candidates of a generation.
-        cells: See `Coarse`.
         run: Seed of the candidates, state file and callback; a search resumes from its state file to the bit.
     """
     if population < 4:

@@ -22,8 +22,6 @@ from advnerf_core.attack.adjoint import (
     AttackProblem,
     BlackBoxError,
     RenderCache,
-    Totals,
-    evaluate,
     gradient_pass,
     roll_out,
 )
@@ -44,7 +42,6 @@ class MultiStart:
     """The budget of a multi-start search; it evaluates ``samples * steps`` drives.
 
     Attributes:
-        samples: Number of drawn poses.
         steps: Evaluations of each, including the drawn one.
         pose_rate: Adam's step along a coordinate of the unit box: 0.1 is a twentieth of the bounds.
         colour_rate: Adam's step of the colours before squashing.
@@ -75,7 +72,6 @@ def multi_start(
 
     Args:
         problem: The attack problem; its sensor must be a `PlacedSensor`.
-        budget: Samples, steps and rates.
         run: Seed of the poses and of the colours' starting noise, state file and callback.
 
     Raises:
@@ -125,7 +121,6 @@ def random_poses(
         problem: The attack problem; its sensor must be a `PlacedSensor`.
         evaluations: Total drives, including a resumed state's; as many as a multi-start's, for a fair comparison.
         sigma: Spread of the colours before squashing.
-        run: Seed of the draws, state file and callback.
 
     Raises:
         PoseBoundsError: The bounds leave no place beside the lane.
@@ -153,23 +148,10 @@ def random_poses(
     return go_on(state, run, fingerprint, evaluations, step)
 
 
-def placed_problem(
-    problem: AttackProblem, theta: Tensor, opaque: bool | None = None
-) -> tuple[AttackProblem, Tensor]:
-    """The problem with the objects at the places of ``theta``, with true edges, and its theta, which is the colours.
-
-    Args:
-        problem: The attack problem, with a `PlacedSensor`.
-        theta: Placements and colours.
-        opaque: True composes without blending, as some deployments do.
-    """
-    surrogate, colours = placed_sensor(problem).sharp(theta, opaque)
+def placed_problem(problem: AttackProblem, theta: Tensor) -> tuple[AttackProblem, Tensor]:
+    """The problem with the objects at the places of ``theta``, with true edges, and its theta, which is the colours."""
+    surrogate, colours = placed_sensor(problem).sharp(theta)
     return replace(problem, sensor=surrogate), colours
-
-
-def judge(problem: AttackProblem, theta: Tensor, opaque: bool | None = None) -> Totals:
-    """Totals of a search's result without disturbances; equal to its best evaluation if the problem has none."""
-    return evaluate(*placed_problem(problem.undisturbed(), theta, opaque))[1]
 
 
 def _gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:

@@ -23,7 +23,6 @@ class CountedPolicy:
 
     Args:
         policy: The victim, in eval mode.
-        calls: Initial count.
 
     Attributes:
         calls: Number of queried images.
@@ -33,14 +32,14 @@ class CountedPolicy:
     differentiable = False
     training = False
 
-    def __init__(self, policy: Any, calls: int = 0) -> None:
+    def __init__(self, policy: Any) -> None:
         if not policy.stateless:
             raise VictimError(
                 "expected a stateless policy, got one with memory: an image alone does not tell its steering; search with the "
                 f"methods {alternatives(black_box_methods(stateless=False))} instead"
             )
         self._policy = policy
-        self.calls = calls
+        self.calls = 0
         self.goal_size = int(getattr(policy, "goal_size", 0))
 
     @torch.no_grad()

@@ -59,7 +59,6 @@ def best_drawn(
     Args:
         draw: Draws one theta, with all randomness from the generator.
         evaluations: Total thetas, including a resumed state's.
-        run: Seed, state file and callback.
         settings: Settings that a state file must match: the method's name, and everything that ``draw`` depends on.
     """
     fingerprint = search_fingerprint(

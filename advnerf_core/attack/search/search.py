@@ -43,7 +43,6 @@ class SearchState:
     Attributes:
         tensors: Search-specific tensors: current theta, optimiser moments, random generator.
         best_theta: Best parameters yet; None before the first evaluation.
-        history: Finished evaluations.
     """
 
     tensors: dict[str, Tensor]
@@ -135,7 +134,6 @@ def begin_drawing(
     """The state of a search that draws, and its generator in the state's position.
 
     Args:
-        run: Seed and state file.
         fresh: Tensors of a new search; their random values come from the generator.
     """
     generator = torch.Generator().manual_seed(run.seed)
@@ -208,7 +206,6 @@ def evaluate_theta(
     Args:
         theta: Theta to evaluate, of the sensor's ``theta_shape``.
         state: State of the search, with tensors ready to be saved.
-        run: State file and callback.
         fingerprint: Fingerprint of the search, see `search_fingerprint`.
 
     Raises:

@@ -11,7 +11,7 @@ from advnerf_core.attack.methods import METHODS, SearchRun, SearchSettings
 from advnerf_core.attack.problem import NoColoursError
 from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.attack.search.frame import CleanFrames, better_side
-from advnerf_core.attack.search.gradient_coarse import NoFinerFaceError
+from advnerf_core.attack.search.gradient import NoFinerFaceError
 from advnerf_core.attack.search.query_count import VictimError
 from advnerf_core.driving.rollout import drive
 from tests.support.attack_toy import random_policy, toy_problem

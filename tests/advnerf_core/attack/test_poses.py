@@ -10,7 +10,7 @@ from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.attack.artifact import AttackFile, AttackFileError
 from advnerf_core.attack.health import central_slopes, frozen_loss, random_directions, slopes_of
 from advnerf_core.attack.methods import SearchRun, SearchSettings
-from advnerf_core.attack.search.poses import MultiStart, judge, multi_start, placed_problem, random_poses
+from advnerf_core.attack.search.poses import MultiStart, multi_start, placed_problem, random_poses
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.attack.spaces.placement import (
@@ -64,6 +64,11 @@ def test_memory_of_a_render_is_that_of_covered_pixels_and_time_batches_do_not_ch
         torch.testing.assert_close(other, whole, rtol=1e-9, atol=1e-12)
 
 
+def judge(problem, theta):
+    """Totals of a search's result."""
+    return evaluate(*placed_problem(problem, theta))[1]
+
+
 def test_soft_edges_look_like_the_true_ones_and_the_judge_uses_the_true_ones():
     problem = moving(free_colours=False)
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(1))
@@ -74,7 +79,6 @@ def test_soft_edges_look_like_the_true_ones_and_the_judge_uses_the_true_ones():
     np.testing.assert_allclose(placement_of(surrogate.objects[0]), problem.sensor.placements(theta)[0])
     expected = evaluate(dataclasses.replace(problem, sensor=surrogate), colours)[1]
     assert torch.equal(judge(problem, theta).protocol_cte_m, expected.protocol_cte_m)
-    assert placed_problem(problem, theta, opaque=True)[0].sensor.opaque
 
 
 def opacity_along(field, start_m, end_m, count=400):
@@ -119,9 +123,9 @@ def test_no_evaluation_leaves_the_bounds_or_stands_on_the_lane():
     space, seen = problem.sensor.space, []
     sharp = problem.sensor.sharp
 
-    def recorded(theta, opaque=None):
+    def recorded(theta):
         seen.append(problem.sensor.unit(theta).clone())
-        return sharp(theta, opaque)
+        return sharp(theta)
 
     problem.sensor.sharp = recorded
     multi_start(problem, MultiStart(samples=3, steps=4, pose_rate=0.8))
