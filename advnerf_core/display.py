@@ -96,9 +96,9 @@ class DisplayModel(PlainData):
             object.__setattr__(self, name, value)
 
     @classmethod
-    def ideal(cls, levels: int = 2) -> DisplayModel:
+    def ideal(cls) -> DisplayModel:
         """A monitor whose colours the camera sees unchanged."""
-        return cls(np.tile(np.linspace(0.0, 1.0, levels), (3, 1)), np.eye(3), np.zeros(3))
+        return cls(np.tile([0.0, 1.0], (3, 1)), np.eye(3), np.zeros(3))
 
     def light(self, shown: ArrayLike) -> Array:
         """Light of the monitor's channels ``[..., 3]`` at shown colours ``[..., 3]``."""

@@ -118,10 +118,10 @@ class FeaturesAndHead(SteeringNetwork):
                 next(self.head.parameters())[:, feature_count:] *= _GOAL_GAIN
 
 
-def images_to_tensor(images: NDArray[np.uint8], dtype: torch.dtype = torch.float32) -> Tensor:
+def images_to_tensor(images: NDArray[np.uint8]) -> Tensor:
     """Tensor ``[B, 3, H, W]`` RGB 0..1 from uint8 images ``[B, H, W, 3]`` (or one image ``[H, W, 3]``)."""
     batch = np.ascontiguousarray(images if images.ndim == 4 else images[None])
     if not batch.flags.writeable:
         batch = batch.copy()  # torch warns about read-only buffers
     # The memory stays channels-last, which is also the faster layout for the convolutions.
-    return torch.from_numpy(batch).permute(0, 3, 1, 2).to(dtype).div(255.0)
+    return torch.from_numpy(batch).permute(0, 3, 1, 2).to(torch.float32).div(255.0)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from advnerf_core.files import write_atomically
 from advnerf_core.inputs import InputFileError, InputFiles
-from advnerf_core.policies.answer import answer
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.declaration import ONNX_METADATA_KEY, declaration_beside
 from advnerf_core.policies.file_network import FileNetwork
@@ -45,11 +44,6 @@ class OnnxNetwork(FileNetwork):
         arrays = {name: _as_kind(feed, self._kinds[name]) for name, feed in feeds.items()}
         found = [np.asarray(each) for each in self._session.run(outputs, arrays)]
         return [each.astype(np.float32) if each.dtype == np.float16 else each for each in found]
-
-    def steering_rad(self, images: NDArray[Any], goals: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Steering ``[B]`` [rad] of images ``[B, 3, H, W]`` RGB 0..1 of a policy without memory: the whole contract, without torch."""
-        raw, _ = answer(self.contract, self, images, goals)
-        return np.asarray(self.contract.to_steering_rad(raw, len(images)))
 
 
 class TensorNetwork:
@@ -121,7 +115,6 @@ def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
     Args:
         network: The network behind the declaration, in eval mode.
         contract: Declaration of the network, which is embedded in the file's metadata.
-        path: Target.
     """
     import onnx
     import torch

@@ -18,6 +18,8 @@ from advnerf_core.plain import PlainData
 _POWERS = (0.3, 3.0)
 # Twelve numbers and a power are fitted: more pairs change the result by less than 8 bits resolve, and cost minutes.
 _MOST_PAIRS = 50_000
+# Share of the pairs with the largest errors that a second fit leaves out: at edges a render is displaced, not differently coloured.
+_TRIM = 0.1
 
 
 @dataclass(frozen=True)
@@ -46,14 +48,12 @@ class ColourMap(PlainData):
 IDENTITY = ColourMap(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
 
 
-def fit_colour_map(learned: ArrayLike, driving: ArrayLike, trim: float = 0.1) -> ColourMap:
+def fit_colour_map(learned: ArrayLike, driving: ArrayLike) -> ColourMap:
     """Fit a map from paired colours.
 
     Args:
         learned: Rendered colours ``[..., 3]`` in 0..1.
         driving: Colours of the driving camera at the same pixels, same shape (uint8 is divided by 255).
-        trim: Share of the pairs with the largest errors to leave out in a second fit: at edges a render is displaced, not
-            differently coloured.
     """
     a, b = _pairs(learned), _pairs(driving)
     if a.shape != b.shape or len(a) < 16:
@@ -73,7 +73,7 @@ def fit_colour_map(learned: ArrayLike, driving: ArrayLike, trim: float = 0.1) ->
         power = float(found.x)
         solution = _solve(x, y, power)[0]
         error = np.abs(_design(a, power) @ solution - b).max(axis=1)
-        keep = error <= np.quantile(error, 1.0 - trim)
+        keep = error <= np.quantile(error, 1.0 - _TRIM)
     rows = tuple((float(r[0]), float(r[1]), float(r[2])) for r in solution[:3].T)
     offset = solution[3]
     return ColourMap(rows, (float(offset[0]), float(offset[1]), float(offset[2])), power)

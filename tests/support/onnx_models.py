@@ -6,6 +6,7 @@ import yaml
 from onnx import TensorProto, helper, numpy_helper
 
 from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.answer import answer
 from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(12, 8, 6.0, 6.0, 6.0, 4.0), crop_top_px=0, crop_height_px=8, width=12, height=8)
@@ -66,4 +67,10 @@ def declare_beside(file, declared):
 
 def steering(network, grey, count=2):
     """Steering of ``count`` images of one grey in 0..1."""
-    return network.steering_rad(np.full((count, 3, 8, 12), grey, np.float32))
+    return steering_of(network, np.full((count, 3, 8, 12), grey, np.float32))
+
+
+def steering_of(network, images):
+    """Steering ``[B]`` [rad] of images ``[B, 3, H, W]`` in 0..1 by an `OnnxNetwork` without memory: the whole contract, without torch."""
+    raw, _ = answer(network.contract, network, images)
+    return np.asarray(network.contract.to_steering_rad(raw, len(images)))

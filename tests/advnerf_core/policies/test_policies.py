@@ -21,6 +21,7 @@ from advnerf_core.policies.onnx_policy import OnnxNetwork, export_onnx
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.policies.view import PolicyView
+from tests.support.onnx_models import steering_of
 
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
 SMALL = replace(VIEW, width=40, height=22)
@@ -145,7 +146,7 @@ def test_a_foreign_onnx_file_is_declared_beside_it(tmp_path):
         OnnxNetwork(file)
     beside = tmp_path / "policy.onnx.policy.yaml"
     beside.write_text(yaml.safe_dump({"view": VIEW.to_dict(), "positive": "right"}))
-    steering = OnnxNetwork(file).steering_rad(images(4).numpy())
+    steering = steering_of(OnnxNetwork(file), images(4).numpy())
     np.testing.assert_allclose(steering, -net()(images(4)).numpy(), atol=1e-5)
     beside.write_text("{view: [")
     with pytest.raises(PolicyContractError, match="cannot read the declaration"):

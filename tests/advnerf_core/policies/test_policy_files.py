@@ -17,7 +17,7 @@ from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.load import load_any_policy, load_driver
 from advnerf_core.policies.onnx_policy import OnnxNetwork
 from advnerf_core.policies.tensors import TensorInfo, chosen_tensors
-from tests.support.onnx_models import IMAGE, VIEW, mean_model, save_beside, steering
+from tests.support.onnx_models import IMAGE, VIEW, mean_model, save_beside, steering, steering_of
 
 CASES = Path(__file__).parents[4] / "shared" / "data" / "cases"
 
@@ -253,7 +253,7 @@ def test_the_files_of_strangers(tmp_path, monkeypatch):
     for name, truth in (("A", 0.01288), ("B", -0.00237)):
         network = OnnxNetwork(Path("..") / name / "model.onnx")
         grey = np.full((1, 3, 66, 200), 0.5, np.float32)
-        assert float(network.steering_rad(grey)[0]) == pytest.approx(truth, abs=6e-6)
+        assert float(steering_of(network, grey)[0]) == pytest.approx(truth, abs=6e-6)
     two = CASES / "onnx_two_outputs" / "two_ta.onnx"
     with pytest.raises(PolicyContractError, match="declare output_name"):
         OnnxNetwork(two)
@@ -261,7 +261,7 @@ def test_the_files_of_strangers(tmp_path, monkeypatch):
     declared = yaml.safe_load((two.parent / "two_ta.onnx.policy.yaml").read_text())
     angle = onnx.load(two).graph.output[1].name
     mine.with_name("two_ta.onnx.policy.yaml").write_text(yaml.safe_dump({**declared, "output_name": angle}))
-    steering_rad = OnnxNetwork(mine).steering_rad(
-        np.random.default_rng(0).random((2, 3, 66, 200), np.float32)
+    steering_rad = steering_of(
+        OnnxNetwork(mine), np.random.default_rng(0).random((2, 3, 66, 200), np.float32)
     )
     assert not np.allclose(steering_rad, 0.7, atol=0.1)
