@@ -57,7 +57,6 @@ class Document:
     """A parsed YAML file that knows the line of every key.
 
     Attributes:
-        data: Content of the file.
         source: File name for error messages.
         places: Origin of each key by its path: ``file:line``, or the override that set it.
     """
@@ -388,7 +387,6 @@ class CsvRow:
         """Finite number in a column.
 
         Args:
-            column: Name of the column.
             default: Value if the file lacks the column, or the row leaves it empty; None if that is an error.
         """
         text = self.values.get(column, "").strip()

@@ -63,7 +63,6 @@ def run_slots(function: Callable[[int], object], slots: int) -> None:
 
     Args:
         function: Does the work of one slot; must write only data of that slot, and release the GIL to gain anything.
-        slots: Number of slots. A few per thread balance the load.
     """
     threads = min(thread_count(), slots)
     if threads <= 1:

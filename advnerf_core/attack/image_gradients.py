@@ -52,7 +52,6 @@ def agrees_in_bfloat16(policy: Any, camera: Pinhole, goal_size: int = 0) -> bool
     on smooth random images. The images depend on nothing else, so that a resumed search decides as it did before.
 
     Args:
-        policy: The policy.
         camera: Size of its images.
         goal_size: Length of its goals; 0 for none.
     """

@@ -108,7 +108,6 @@ def draw_placements(
 
     Args:
         placements: Current placements ``[K, 4]``.
-        paths: Reference paths.
         drives: Positions ``[T + 1, 2]`` of drives by name.
     """
     figure = Figure(figsize=(7.0, 6.2), layout="constrained", facecolor=LIGHT["paper"])

@@ -19,7 +19,6 @@ class CleanDrive(PlainData):
         total_cte_m: Total CTE of each drive [m].
         mean_cte_m: Mean |CTE| of each [m].
         max_cte_m: Largest |CTE| of each [m].
-        off_track: Whether each left the track.
         ticks: Control ticks of a drive.
         off_track_m: |CTE| beyond which the car is off the track [m].
     """

@@ -32,7 +32,6 @@ class HashGridConfig:
     """Sizes of a multiresolution hash grid.
 
     Attributes:
-        levels: Number of levels L.
         features: Features per entry F.
         log2_entries: Largest number of entries of a level, as a power of two.
         coarsest: Cells per axis of the coarsest level.

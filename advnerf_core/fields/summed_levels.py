@@ -24,7 +24,6 @@ def with_summed_levels(
     Args:
         field: An object whose free rows are given directly. A row that several voxels show takes their mean.
         levels: Number of grids; each spans the object's box, with ``n^3`` cells at whose centres the values sit.
-        coarsest: Cells along an edge of the first grid.
         finest: Cells along an edge of the last grid; sizes between grow geometrically, and equal sizes are kept once.
 
     Returns:

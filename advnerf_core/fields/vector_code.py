@@ -18,9 +18,7 @@ class VectorCode:
 
     Args:
         context: Target context of numba.
-        builder: Instruction builder.
         kinds: Types of the arguments.
-        values: The arguments.
         lanes: Floats in a vector.
 
     Attributes:

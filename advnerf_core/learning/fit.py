@@ -38,12 +38,10 @@ class FitConfig:
 
     Attributes:
         steps: Optimiser steps.
-        batch_size: Frames per step.
         learning_rate: Peak; linear warm-up, then a half cosine to a hundredth of it.
         warm_up_steps: Length of the warm-up.
         huber_rad: Errors beyond this count linearly [rad].
         checkpoint_every: Steps between checkpoints.
-        augment: Image augmentation.
     """
 
     steps: int
@@ -69,7 +67,6 @@ def fit(
 
     Args:
         policy: The network; its weights are the start unless the checkpoint holds a later step.
-        frames: Training frames.
         checkpoint: File to continue from and to write every ``checkpoint_every`` steps and at the end.
         report: Called with the step and the running mean square error [rad^2].
         number_type: float32 or bfloat16, of the layers of a network with ``rows_independent``; None for the machine's
@@ -115,8 +112,6 @@ class Gradients:
     """The gradients of a network's loss on the batches of a training.
 
     Args:
-        policy: The network.
-        config: Settings of the training.
         number_type: Number type of its layers, if its rows are independent.
     """
 

@@ -69,8 +69,6 @@ def train_policy(
         view: Conversion of camera images to policy images; stored in the policy file.
         out_dir: Also keeps frames and checkpoints. Calling again with the same settings continues or returns at once; with
             other settings it is an error.
-        progress: Progress callback.
-        number_type: See `fit`.
     """
     return _Recipe(config, plans, expert, view, out_dir, progress, number_type).run()
 

@@ -65,7 +65,6 @@ class ImitationConfig:
         first_steps: Optimiser steps of behaviour cloning.
         round_steps: Optimiser steps after each DAgger round.
         naive_steps: Optimiser steps of a second policy that never sees a random texture; 0 trains none.
-        batch_size: Frames per step.
         learning_rate: Peak learning rate; continued training starts at half of it.
         lateral_m: Stills are up to this far from the path [m].
         heading_rad: Stills are turned up to this much from the path's heading [rad].
@@ -73,8 +72,6 @@ class ImitationConfig:
         drive_heading_rad: DAgger drives are turned up to this much from the path's heading [rad].
         give_up_m: A drive ends when |CTE| exceeds this [m]; frames from further away teach little.
         max_steering_rad: Bound of the policy's output [rad].
-        architecture: Architecture of the policy, with its settings.
-        augment: Image augmentation.
         holdout_every: One block of frames in this many is kept for validation.
     """
 
@@ -107,11 +104,9 @@ class TrainedPolicy:
     """Result of the recipe.
 
     Attributes:
-        path: Policy file.
         validation_mae_rad: Mean absolute steering error on held-out frames [rad].
         naive_path: File of the policy that never saw a random texture, if one was asked for.
         naive_validation_mae_rad: Mean absolute error of that policy on held-out plain frames [rad].
-        frames: Number of collected frames.
         seconds: Time spent in this call on each part: collect, train [s].
     """
 

@@ -26,13 +26,10 @@ class FineTuneConfig:
     """Settings of a fine-tuning.
 
     Attributes:
-        steps: Optimiser steps.
-        batch_size: Frames per step.
         learning_rate: Peak; lower than for training from scratch.
         new_share: Share of the training frames that is new, by repeating them; 0.5 weighs old and new alike. None repeats
             nothing.
         holdout_every: One block of frames in this many is held out for validation.
-        augment: Image augmentation.
     """
 
     steps: int = 400
@@ -53,7 +50,6 @@ class Retrained:
     """A fine-tuned policy.
 
     Attributes:
-        path: Policy file.
         old_mae_rad: Mean absolute error on held-out old frames, before and after [rad].
         new_mae_rad: The same on held-out new frames [rad].
     """
@@ -70,8 +66,6 @@ class MixedFrames(FrameSet):
     Args:
         old: Shards that the policy was trained on.
         new: Shards with the found objects.
-        new_share: See `FineTuneConfig`.
-        holdout_every: See `FrameSet`.
     """
 
     def __init__(
@@ -115,7 +109,6 @@ def fine_tune(
         policy: The policy to start from; it is not changed.
         old: Shards it was trained on.
         new: Shards with the found objects, labelled by the expert.
-        out_file: Policy file to write.
         report: Called with the step and the running mean square error [rad^2].
 
     Raises:

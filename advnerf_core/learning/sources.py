@@ -90,7 +90,6 @@ class SceneSource:
     """Frames of a scene that steps itself.
 
     Args:
-        name: Name of the shards.
         scene: The scene, for instance the synchronous lab.
         view: Conversion of camera images to policy images.
         speed_mps: Commanded speed [m/s].
@@ -167,9 +166,7 @@ class RenderedSource:
     """Frames of a batch renderer, such as the surrogate.
 
     Args:
-        name: Name of the shards.
         prepare: Takes states ``[B, 3]``, renders everything that does not depend on the texture (the background), returns ``Show``.
-        dynamics: Vehicle model for drives.
         sample_texture: Draws a texture parameter for ``Show``; None for scenes without a changing object.
         batch_size: States per call of ``prepare``, and drives side by side.
     """

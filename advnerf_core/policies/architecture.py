@@ -96,7 +96,6 @@ class BuiltIn:
 
     Attributes:
         module: Module of `advnerf_core.policies` that holds the class.
-        name: Name of the class.
         title: One line for lists.
     """
 
@@ -242,7 +241,6 @@ def require_architecture(
     """Raise unless a reference names an architecture, or for wrong settings of a built-in one; nothing is loaded.
 
     Args:
-        reference: See `load_architecture`.
         folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
 
     Raises:

@@ -16,7 +16,6 @@ class Driver:
 
     Args:
         network: Called as in `advnerf_core.policies.answer`.
-        contract: Declaration of the network.
         sha256: Hash of the policy.
     """
 

@@ -77,7 +77,6 @@ class EgoDriver:
 
     Args:
         address: ``grpc://HOST:PORT`` on this computer, or ``grpcs://HOST:PORT`` by TLS.
-        rig: Car and camera.
 
     Raises:
         PolicyContractError: The address is invalid, its package is not installed, or no driver answers.

@@ -20,8 +20,6 @@ class Exportable:
     Attributes:
         network: Called with ``examples``.
         examples: Inputs for a batch of two.
-        inputs: Names of the inputs.
-        outputs: Names of the outputs.
         contract: The declaration without names in the file.
         initial: Memory of one car before the first image; empty for a network without memory.
     """

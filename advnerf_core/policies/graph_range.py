@@ -16,11 +16,7 @@ _LARGEST_OF_ONE = 8.0
 
 
 def value_max_of(path: Path, image: str) -> float | None:
-    """White in the images of an ONNX file, 1 or 255, by its normalisation; None without one.
-
-    Args:
-        image: Name of the input.
-    """
+    """White in the images of an ONNX file, 1 or 255, by its normalisation; None without one."""
     import onnx
 
     graph = onnx.load(path, load_external_data=False).graph

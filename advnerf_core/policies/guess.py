@@ -34,7 +34,6 @@ class Question:
 
     Attributes:
         key: Key of the declaration, with dots for a section's.
-        text: The question as text.
         choices: Possible answers; empty for a number or a section.
     """
 

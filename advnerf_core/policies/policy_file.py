@@ -46,7 +46,6 @@ class LoadedPolicy:
         policy: A `SteeringNetwork` or an ``AdaptedPolicy`` with ``stateless`` and ``goal_size``, in eval mode, without gradients to its
             weights.
         view: Conversion of camera images to policy images.
-        metadata: The trainer's metadata.
         sha256: Hash over weights and metadata; identifies the policy in manifests and attack files.
     """
 

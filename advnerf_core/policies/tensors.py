@@ -41,12 +41,7 @@ class Tensors:
     """Inputs and outputs of a policy file with their uses.
 
     Attributes:
-        inputs: All inputs, in the file's order.
-        outputs: All outputs, in the file's order.
-        image: The input for the images.
         goal: The input for the goals; None for a policy without a goal.
-        steering: The output that steers.
-        states: States carried from image to image.
     """
 
     inputs: tuple[TensorInfo, ...]

@@ -233,7 +233,6 @@ class _TorchWalk:
         nominal: The object at its nominal placement.
         colours: Colour vector ``[rows, 3]``.
         poses: ``T_world_from_camera [B, 4, 4]``.
-        lens: Camera.
         supersample: Rays along each side of a pixel.
         least: A ray is followed until less light than this remains.
         device: Where it is computed; arguments and results are on the CPU.

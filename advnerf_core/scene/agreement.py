@@ -57,7 +57,6 @@ class Comparison:
     """One part on a device and on the processor.
 
     Attributes:
-        part: Name of the part.
         difference: Largest difference, relative to the largest value.
         tolerance: Difference up to which they agree.
         seconds: Time of the second run on the device [s].

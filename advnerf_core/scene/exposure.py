@@ -63,7 +63,6 @@ class Exposures:
 
         Args:
             rays: The batch, with its gradient.
-            step: Step number from 0.
             rate: Learning rate of the field.
         """
         pull = np.float32(_PULL / (3.0 * max(len(rays.photographs), 1)))

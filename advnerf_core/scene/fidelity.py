@@ -27,7 +27,6 @@ class SceneAgreement:
 
     Attributes:
         psnr_db: PSNR of each view [dB].
-        ssim: SSIM of each view.
         real: Steering on each real picture.
         learned: Steering on each learned one.
     """

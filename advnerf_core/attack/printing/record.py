@@ -31,7 +31,6 @@ class PrintRecord(PlainData):
         sheet_m: Width and height with the border [m].
         dictionary: OpenCV's name of the markers.
         markers: Corners ``[4, 3]`` by number [m]; see `MarkerFrame.corners_m`.
-        dpi: Pixels per inch.
         attack_id: The attack of a poster.
         attack_file: Path of the attack, relative to the record's folder.
         object: The object that carries the texture.
@@ -99,14 +98,7 @@ def record_of(frame: MarkerFrame, dpi: float, **others: Any) -> PrintRecord:
 
 
 def poster_record(poster: Poster, attack_file: Path, folder: Path, dpi: float) -> PrintRecord:
-    """The record of a poster with markers.
-
-    Args:
-        poster: The poster.
-        attack_file: File of its attack.
-        folder: Folder of the record.
-        dpi: Pixels per inch.
-    """
+    """The record of a poster with markers."""
     assert poster.frame is not None, "a poster without markers cannot be measured"
     seen_from = Path(os.path.relpath(attack_file.resolve(), folder.resolve())).as_posix()
     about = {"attack_id": poster.attack.attack_id, "attack_file": seen_from, "object": poster.name}
