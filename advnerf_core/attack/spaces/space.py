@@ -226,26 +226,7 @@ class ColourSpace:
 
 
 class FaceSpace(ColourSpace):
-    """Colours of a face that hides its panel; without an attack the learned panel is seen.
-
-    Args:
-        surrogate: The scene with the face as its only object.
-        named: Entries of the face in attack files.
-        display: Optics of the screen and the room; None for a board, or for a screen that is assumed ideal.
-        cos_angle: Cosine of the angle at which the camera looks at a screen; see `DisplayedSensor`.
-    """
-
-    def __init__(
-        self,
-        surrogate: Surrogate,
-        named: NamedObject,
-        mount: FaceMount,
-        display: DisplayModel | None = None,
-        cos_angle: float = 1.0,
-    ) -> None:
-        if len(surrogate.objects) != 1:
-            raise ValueError(f"expected a surrogate with one face, got {len(surrogate.objects)} objects")
-        super().__init__(surrogate, [named], display, cos_angle, mount)
+    """Colours of a face, the only object, that hides its panel; without an attack the learned panel is seen."""
 
     @property
     def plain(self) -> Shown:

@@ -93,8 +93,8 @@ def face_space(
     mount = FaceMount(wanted.panel, (panel.square_m, panel.square_m), corners_on(panel))
     named = NamedObject("face", field.sha256)
     if not isinstance(wanted, ScreenConfig) or (not wanted.display_model if ideal is None else ideal):
-        return FaceSpace(surrogate, named, mount)
-    return FaceSpace(surrogate, named, mount, display_of(experiment), mean_cos_angle(experiment))
+        return FaceSpace(surrogate, [named], mount=mount)
+    return FaceSpace(surrogate, [named], display_of(experiment), mean_cos_angle(experiment), mount)
 
 
 def mean_cos_angle(experiment: Experiment) -> float:
