@@ -5,7 +5,7 @@ Unlit, like the objects of an attack: a pixel shows the texture. Several rays a 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numba import njit
@@ -45,24 +45,10 @@ def draw_mesh(
     return images
 
 
-def _draw(
-    corners: Any,
-    uv: Any,
-    part_of: Any,
-    texels: Any,
-    shapes: Any,
-    firsts: Any,
-    lens: Any,
-    depth: Any,
-    image: Any,
-) -> None:
-    bands = slot_bounds(len(depth), _BANDS)
-
-    def draw_band(band: int) -> None:
-        top, bottom = bands[band]
-        _draw_band(corners, uv, part_of, texels, shapes, firsts, lens, depth, image, top, bottom)
-
-    run_slots(draw_band, _BANDS)
+def _draw(*arguments: Any) -> None:
+    """Draw all rows, in bands, with the arguments of `_draw_band`."""
+    bands, draw_band = slot_bounds(len(arguments[-1]), _BANDS), cast(Any, _draw_band)
+    run_slots(lambda band: draw_band(*arguments, *bands[band]), _BANDS)
 
 
 def _atlas(mesh: SurfaceMesh) -> tuple[Any, Any, Any]:
