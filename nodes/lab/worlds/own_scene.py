@@ -67,6 +67,7 @@ class OwnScene(Undriven):
 
     Config: ClassVar[type[OwnSceneConfig]] = OwnSceneConfig
     known_by = "a learned scene"
+    photo_poses = Undriven._refuse
 
     def __init__(self, config: OwnSceneConfig) -> None:
         self.config = config
