@@ -87,7 +87,7 @@ def make_scene(folder: Path, frames: int, steps: int) -> tuple[Path, str]:
             photograph(lab, video_poses(config, frames), phone)
         if not (bag / "metadata.yaml").exists():
             record_drive(lab, bag)
-    imported = from_phone_and_car(
+    report = from_phone_and_car(
         [phone],
         bag,
         data,
@@ -97,7 +97,7 @@ def make_scene(folder: Path, frames: int, steps: int) -> tuple[Path, str]:
         0.08,
         say,
     )
-    placing, model = imported.report["placing"], imported.report["structure_from_motion"]
+    placing, model = report["placing"], report["structure_from_motion"]
     listed = load_transforms(data / "transforms_phone.json")
     low, high = ((float(x), float(y), float(z)) for x, y, z in listed.box())
     trained = train_scene(

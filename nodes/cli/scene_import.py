@@ -15,7 +15,7 @@ from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import print_table, table
 
 if TYPE_CHECKING:
-    from nodes.lab.importing.data_set import Imported
+    from nodes.lab.importing.data_set import Facts
 
 app = typer.Typer()
 
@@ -304,7 +304,7 @@ def _from_media(
 
 
 def _run(name: str, output: Path, work: Any) -> None:
-    from nodes.lab.importing.staging import work_folder
+    from nodes.lab.importing.staging import ALL_TRANSFORMS, work_folder
     from nodes.runtime.progress import ProgressDisplay
     from nodes.runtime.terminal import say_error
     from nodes.runtime.termination import ends_in_order
@@ -312,7 +312,7 @@ def _run(name: str, output: Path, work: Any) -> None:
     code = 0
     try:
         with ends_in_order(), ProgressDisplay() as display:
-            imported: Imported = work(display.start(name))
+            facts: Facts = work(display.start(name))
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
     except SystemExit as asked:
@@ -322,11 +322,11 @@ def _run(name: str, output: Path, work: Any) -> None:
         going_on = f"finished work is kept in {kept}; run the same command to resume"
         say_error(f"stopped; {going_on if kept.exists() else 'no files were left'}")
         raise typer.Exit(code)
-    _print_report(imported)
+    _print_report(facts)
+    print("\n".join(str(output / name) for name in ALL_TRANSFORMS if (output / name).exists()))
 
 
-def _print_report(imported: Imported) -> None:
-    facts = imported.report
+def _print_report(facts: Facts) -> None:
     if "recorded_frames" in facts:
         print(
             f"{facts['taken_frames']} of {facts['recorded_frames']} frames used, {facts['without_pose']} had no motion-capture pose"
@@ -347,7 +347,6 @@ def _print_report(imported: Imported) -> None:
     if "up" in facts:
         print(f"up: {facts['up']}")
     print(f"scale: {facts['scale']}")
-    print("\n".join(str(path) for path in imported.transforms))
 
 
 def _print_model(model: dict[str, Any]) -> None:

@@ -1,9 +1,8 @@
-"""Makes data sets from images and recordings: a ``transforms.json`` and a report."""
+"""Makes data sets from images and recordings: a ``transforms.json`` and a report, whose content each import returns."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,21 +41,7 @@ _BOX_PERCENT, _BOX_MARGIN = 0.5, 0.05
 _UNBOUNDED = 16
 
 
-@dataclass(frozen=True, eq=False)
-class Imported:
-    """Result of an import.
-
-    Attributes:
-        transforms: The ``transforms.json`` files, the complete one first.
-        report: Content of the report file.
-    """
-
-    transforms: tuple[Path, ...]
-    report: dict[str, Any]
-
-    def moved_to(self, folder: Path) -> Imported:
-        """Return the same result in another folder."""
-        return replace(self, transforms=tuple(folder / path.name for path in self.transforms))
+Facts = dict[str, Any]
 
 
 def from_media(
@@ -67,7 +52,7 @@ def from_media(
     extent_m: float,
     metric: MetricOptions,
     report: Report,
-) -> Imported:
+) -> Facts:
     """Make an upright data set from videos and photographs.
 
     Args:
@@ -79,7 +64,7 @@ def from_media(
         metric: Known facts about the world.
     """
 
-    def build(folder: Path) -> Imported:
+    def build(folder: Path) -> Facts:
         sources = gather(
             media, folder, media_config, lambda share, text="": report(_MEDIA_SHARE * share, text)
         )
@@ -92,7 +77,7 @@ def from_media(
         facts = {"structure_from_motion": model.summary(), **placing}
         return write_model_set(folder, model, poses, points, facts)
 
-    return build_beside(output, media, build).moved_to(output)
+    return build_beside(output, media, build)
 
 
 def from_bag(
@@ -102,7 +87,7 @@ def from_bag(
     margin_m: float,
     report: Report,
     calibration: Path | None = None,
-) -> Imported:
+) -> Facts:
     """Make a data set from recorded frames with motion-capture poses. No pose is estimated.
 
     Args:
@@ -113,16 +98,15 @@ def from_bag(
         calibration: Camera calibration file; None uses the one in the bag.
     """
 
-    def build(folder: Path) -> Imported:
+    def build(folder: Path) -> Facts:
         frames = take_frames(bag, folder / IMAGES / CAR_CAMERA, config, report, calibration)
         positions = frames.T_world_from_camera[:, :3, 3]
         facts = {"bag": str(bag), **_bag_facts(frames), "scale": "metric: motion capture"}
         reach = np.concatenate([positions - margin_m, positions + margin_m])
-        path = folder / TRANSFORMS
-        _write_car(path, frames, {**_box(reach, margin=0.0), "world": "mocap"})
-        return _finish(folder, (path,), facts)
+        _write_car(folder / TRANSFORMS, frames, {**_box(reach, margin=0.0), "world": "mocap"})
+        return _reported(folder, facts)
 
-    return build_beside(output, (), build, resumes=False).moved_to(output)
+    return build_beside(output, (), build, resumes=False)
 
 
 def from_phone_and_car(
@@ -135,14 +119,14 @@ def from_phone_and_car(
     tolerance_m: float,
     report: Report,
     calibration: Path | None = None,
-) -> Imported:
+) -> Facts:
     """Combine phone media and frames of a bag in one model, metric and in the motion-capture world.
 
     ``transforms.json`` has all registered images with the model's poses, ``transforms_phone.json`` only the phone's (for
     training), ``transforms_car.json`` all frames of the car with their motion-capture poses (to fit colours and to compare).
     """
 
-    def build(folder: Path) -> Imported:
+    def build(folder: Path) -> Facts:
         frames = take_frames(
             bag,
             folder / IMAGES / CAR_CAMERA,
@@ -176,7 +160,7 @@ def from_phone_and_car(
         }
         return _write_joint(folder, model, placed, frames, facts)
 
-    return build_beside(output, media, build).moved_to(output)
+    return build_beside(output, media, build)
 
 
 def _reconstruct(output: Path, sources: Sequence[PhotoSource], sfm: SfmConfig, report: Report) -> Model:
@@ -194,10 +178,10 @@ def write_model_set(
     model: Model,
     poses: Array,
     points: Array,
-    facts: dict[str, Any],
+    facts: Facts,
     pictures: Sequence[Picture] = (),
     reached: Array | None = None,
-) -> Imported:
+) -> Facts:
     """Write ``transforms.json`` for images that are in a folder, and the report.
 
     Args:
@@ -208,18 +192,16 @@ def write_model_set(
         pictures: Masks and splits of the images; empty for none.
         reached: Points ``[M, 3]`` around the content, for a scene without points.
     """
-    path = output / TRANSFORMS
     box = _box_of(points, poses) if len(points) else _open_box(poses, reached)
     if not len(points) and read_stored(output / model.images[0].name)[1] is not None:
         box = {}  # training finds that of the silhouettes
     masks = [output / MASKS / f"{each.name}.png" if each.mask else None for each in pictures]
-    _write_model(path, output, model, poses, range(len(model.images)), {**box, **_splits(pictures)}, masks)
-    return _finish(output, (path,), facts)
+    extra = {**box, **_splits(pictures)}
+    _write_model(output / TRANSFORMS, output, model, poses, range(len(model.images)), extra, masks)
+    return _reported(output, facts)
 
 
-def _write_joint(
-    output: Path, model: Model, placed: Placed, frames: DrivenFrames, facts: dict[str, Any]
-) -> Imported:
+def _write_joint(output: Path, model: Model, placed: Placed, frames: DrivenFrames, facts: Facts) -> Facts:
     poses, everything = placed.T_world_from_camera, range(len(model.images))
     extra = {**_box_of(placed.points, poses), "world": "mocap"}
     phone = [index for index in everything if model.images[index].camera_id != CAR_CAMERA]
@@ -227,11 +209,10 @@ def _write_joint(
         raise ImportRecordingError(
             "expected images of the phone in one model with the car's, got none; also film along the track at the car's height"
         )
-    paths = (output / TRANSFORMS, output / TRANSFORMS_PHONE, output / TRANSFORMS_CAR)
-    _write_model(paths[0], output, model, poses, everything, extra)
-    _write_model(paths[1], output, model, poses, phone, extra)
-    _write_car(paths[2], frames, extra)
-    return _finish(output, paths, facts)
+    _write_model(output / TRANSFORMS, output, model, poses, everything, extra)
+    _write_model(output / TRANSFORMS_PHONE, output, model, poses, phone, extra)
+    _write_car(output / TRANSFORMS_CAR, frames, extra)
+    return _reported(output, facts)
 
 
 def _write_model(
@@ -279,7 +260,7 @@ def _write_car(path: Path, frames: DrivenFrames, extra: dict[str, Any]) -> None:
     )
 
 
-def _bag_facts(frames: DrivenFrames) -> dict[str, Any]:
+def _bag_facts(frames: DrivenFrames) -> Facts:
     return {
         "recorded_frames": frames.recorded,
         "without_pose": frames.without_pose,
@@ -312,6 +293,6 @@ def _box(corners: Array, margin: float) -> dict[str, Any]:
     return {"aabb_scale": 1, "scale": scale, "offset": (0.5 - scale * 0.5 * (low + high)).tolist()}
 
 
-def _finish(output: Path, transforms: tuple[Path, ...], facts: dict[str, Any]) -> Imported:
+def _reported(output: Path, facts: Facts) -> Facts:
     write_json(output / REPORT_FILE, facts)
-    return Imported(transforms, facts)
+    return facts

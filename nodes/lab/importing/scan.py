@@ -14,7 +14,7 @@ from advnerf_core.geometry import Pinhole
 from calibration.photo_model import MIN_IMAGES, LeftOut, Model, Registered
 from calibration.scans.reading import read_scan
 from calibration.scans.scan import Picture, Scan, ScanError, ScanOptions
-from nodes.lab.importing.data_set import Imported, write_model_set
+from nodes.lab.importing.data_set import Facts, write_model_set
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import IMAGES
 from nodes.lab.importing.metric import OwnScale, place, undistorted_views
@@ -27,9 +27,7 @@ _READING_SHARE = 0.1
 _ROUNDING_PX = 1.0
 
 
-def from_scan(
-    path: Path, output: Path, options: ScanOptions, metric: MetricOptions, report: Report
-) -> Imported:
+def from_scan(path: Path, output: Path, options: ScanOptions, metric: MetricOptions, report: Report) -> Facts:
     """Make an upright data set with the poses and lenses of a scan.
 
     Args:
@@ -42,7 +40,7 @@ def from_scan(
         AdvnerfError: The scan cannot be used.
     """
 
-    def build(folder: Path) -> Imported:
+    def build(folder: Path) -> Facts:
         report(0.0, "reading the scan")
         kind, scan = read_scan(path, options)
         made = {folder.resolve(), output.resolve()}
@@ -68,7 +66,7 @@ def from_scan(
         return write_model_set(folder, kept, poses, points, facts, pictures, similarity.points(scan.reached))
 
     inputs = [path] if options.images is None else [path, options.images]
-    return build_beside(output, inputs, build, resumes=False).moved_to(output)
+    return build_beside(output, inputs, build, resumes=False)
 
 
 def _with_reading(share: float) -> float:

@@ -16,6 +16,7 @@ from nodes.runtime.locks import HeldError, hold
 
 TRANSFORMS, REPORT_FILE, COLMAP, MASKS = "transforms.json", "import.json", "colmap", "masks"
 TRANSFORMS_PHONE, TRANSFORMS_CAR = "transforms_phone.json", "transforms_car.json"
+ALL_TRANSFORMS = (TRANSFORMS, TRANSFORMS_PHONE, TRANSFORMS_CAR)
 # In the order in which they are moved. After the last one, the folder is a data set.
 _ENTRIES = (IMAGES, MASKS, COLMAP, REPORT_FILE, TRANSFORMS_PHONE, TRANSFORMS_CAR, TRANSFORMS)
 _CLAIM, _LOCK = ".made_by_advnerf", ".lock"
