@@ -25,7 +25,7 @@ from nodes.bags.writer import BagWriter
 from nodes.lab.policy_data.evaluate import compared, predict
 from nodes.lab.policy_data.frames import HOLDOUT_EVERY
 from nodes.lab.policy_data.logs import OpenLog, open_log, open_logs
-from nodes.lab.policy_data.recordings import policy_view, recorded_frames, training_recording
+from nodes.lab.policy_data.recordings import policy_view, recorded_frames
 from nodes.lab.policy_data.train import train_from_recordings
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import encode, header, image_message, pose_message, types
@@ -85,7 +85,7 @@ def held_out_error_rad(learned: OpenLog, judged: OpenLog, out: Path, steps: int,
     room = load_calibration(RoomCalibration, _CALIBRATION / "room.yaml")
     expert = Expert(room.reference_path, ExpertConfig(speed_mps=_SPEED_MPS))
     config = ImitationConfig(seed=seed, dagger_rounds=0, first_steps=steps, holdout_every=HOLDOUT_EVERY)
-    done = train_from_recordings([training_recording(learned, view, expert)], view, expert, config, out)
+    done = train_from_recordings([learned], view, expert, config, out)
     policy = load_any_policy(str(done.path)).policy
     recording = recorded_frames(judged, view, expert)
     return compared(recording, predict(policy, recording.frames.images), "recorded", True)[

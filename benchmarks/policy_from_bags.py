@@ -24,7 +24,6 @@ from advnerf_core.policies.view import PolicyView
 from benchmarks.results import record_row
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration
 from nodes.lab.policy_data.logs import open_logs
-from nodes.lab.policy_data.recordings import training_recording
 from nodes.lab.policy_data.train import Training, train_from_recordings
 from nodes.lab.trials.evaluation import score, trajectory
 from nodes.lab.trials.trial import TrialOutcome, TrialPlan
@@ -63,8 +62,7 @@ def train(bags: list[Path], out: Path, steps: int) -> Training:
     view = PolicyView(camera.pinhole, distortion=camera.distortion)
     expert = Expert(room.reference_path, ExpertConfig(speed_mps=_SPEED_MPS))
     logs = open_logs(map(LogRequest, bags), LogChoice(), "expert")
-    parts = [training_recording(log, view, expert) for log in logs]
-    return train_from_recordings(parts, view, expert, ImitationConfig(first_steps=steps), out, progress=_say)
+    return train_from_recordings(logs, view, expert, ImitationConfig(first_steps=steps), out, progress=_say)
 
 
 def drive(policy: Path, run_dir: Path, laps: float) -> TrialOutcome:

@@ -137,7 +137,6 @@ def train(
         crop_notes,
         policy_view,
         steering_bound_rad,
-        training_recording,
     )
     from nodes.lab.policy_data.train import train_from_recordings
     from nodes.runtime.progress import ProgressDisplay
@@ -156,9 +155,8 @@ def train(
         holdout_every=HOLDOUT_EVERY,
     )
     plan = None if surrogate is None else _surrogate(surrogate, experiment, setting, view)
-    parts = [training_recording(each, view, expert) for each in opened]
     with ProgressDisplay() as display:
-        done = train_from_recordings(parts, view, expert, config, output, plan, display.start("policy"))
+        done = train_from_recordings(opened, view, expert, config, output, plan, display.start("policy"))
     labels_of = {
         each.name: f"{each.labels}: {each.log.unit}" if each.labels == "recorded" else "expert"
         for each in opened

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,7 +14,6 @@ from advnerf_core.policies.view import PolicyView
 from calibration.schema import Calibration, CameraCalibration, load_calibration
 from nodes.lab.policy_data.frames import RecordedFrames, frames_of, view_for_size, view_of
 from nodes.lab.policy_data.logs import OpenLog
-from nodes.lab.policy_data.train import TrainingRecording
 
 _LEAST_BOUND_RAD = 0.30
 _BOUND_OVER_LABEL = 1.1  # the bound of a network is where its tanh never arrives
@@ -23,16 +21,8 @@ _BOUND_OVER_LABEL = 1.1  # the bound of a network is where its tanh never arrive
 Model = TypeVar("Model", bound=Calibration)
 
 
-def training_recording(opened: OpenLog, view: PolicyView, expert: Expert | None) -> TrainingRecording:
-    """A log as a part of a training; images of another size than the view's are cropped at the same fraction."""
-    log, options = opened.log, {**asdict(opened.choice), "labels": opened.labels}
-    return TrainingRecording(
-        opened.name, log.files, options, lambda: recorded_frames(opened, view, expert), log.unchecked
-    )
-
-
 def recorded_frames(opened: OpenLog, view: PolicyView, expert: Expert | None) -> RecordedFrames:
-    """The usable frames of a log with its labels."""
+    """The usable frames of a log with its labels; images of another size than the view's are cropped at the same fraction."""
     return frames_of(opened.log, view_of(opened.log, view), expert, opened.labels)
 
 

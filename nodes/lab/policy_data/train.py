@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,35 +22,11 @@ from advnerf_core.learning.recipe import ImitationConfig, SourcePlan
 from advnerf_core.places import require_utf8
 from advnerf_core.policies.policy_file import copy_policy, save_policy
 from advnerf_core.policies.view import PolicyView
-from nodes.lab.policy_data.frames import RecordedFrames
+from nodes.lab.policy_data.logs import OpenLog
+from nodes.lab.policy_data.recordings import recorded_frames
 from nodes.runtime.progress import Report
 
 POLICY = "policy.safetensors"
-
-
-@dataclass(frozen=True)
-class TrainingRecording:
-    """One recording of the training data.
-
-    Attributes:
-        name: Name for messages and for the policy's metadata.
-        files: Files of the recording. If their sizes or times change, it counts as another recording.
-        options: Options of extraction and labels.
-        cut: Extracts the frames.
-        unchecked: Why damage to messages may go unnoticed; empty if checksums cover them.
-    """
-
-    name: str
-    files: tuple[Path, ...]
-    options: dict[str, Any]
-    cut: Callable[[], RecordedFrames]
-    unchecked: str = ""
-
-    @property
-    def digest(self) -> str:
-        """Digest of the recording's files and options."""
-        files = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in self.files]
-        return _digest([self.name, files, self.options])
 
 
 @dataclass(frozen=True)
@@ -75,7 +51,7 @@ class Training:
 
 
 def train_from_recordings(
-    parts: Sequence[TrainingRecording],
+    logs: Sequence[OpenLog],
     view: PolicyView,
     expert: Expert,
     config: ImitationConfig,
@@ -83,14 +59,15 @@ def train_from_recordings(
     surrogate: SourcePlan | None = None,
     progress: Report | None = None,
 ) -> Training:
-    """Train on recordings, and on the surrogate if given, and write ``policy.safetensors`` to ``out``.
+    """Train on logs, and on the surrogate if given, and write ``policy.safetensors`` to ``out``.
 
     Frames and checkpoints are in ``out/work/<digest of all inputs>``. The same call resumes, or returns at once if finished. Other
     recordings or settings start a new training, and remove the earlier work when they are finished.
     """
     require_utf8(out.absolute())
+    digests = {log.name: _digest_of(log) for log in logs}
     claim = {
-        "parts": {part.name: part.digest for part in parts},
+        "parts": digests,
         "view": view.to_dict(),
         "expert": expert.to_dict(),
         "config": config.settings(),
@@ -101,17 +78,17 @@ def train_from_recordings(
     work = out / "work" / _digest(claim)
     report: Report = progress or (lambda share, text="": None)
     store = FrameStore(work / "frames")
-    left_out = {part.name: _cut(part, store, work, report) for part in parts}
+    left_out = {log.name: _cut(log, digests[log.name], view, expert, store, work, report) for log in logs}
     if surrogate is None:
-        sha256, mae = _clone(store, view, expert, config, work, {"recordings": claim["parts"]}, report)
+        sha256, mae = _clone(store, view, expert, config, work, {"recordings": digests}, report)
     else:
         bare: ImitationProgress = lambda share, text, learned=None: report(share, text)  # noqa: E731 - typed
         trained = train_policy(config, [surrogate], expert, view, work, bare)
         sha256, mae = trained.sha256, trained.validation_mae_rad
     copy_policy(work / POLICY, out / POLICY)
     frames = {name: len(store.load(name)) for name in store.names()}
-    named = {part.name: frames.pop(_shard(part)) for part in parts}
-    unchecked = {part.name: part.unchecked for part in parts if part.unchecked}
+    named = {name: frames.pop(_shard(digest)) for name, digest in digests.items()}
+    unchecked = {each.name: each.log.unchecked for each in logs if each.log.unchecked}
     result = Training(out / POLICY, sha256, mae, {**named, **frames}, left_out, unchecked)
     summary = {**asdict(result), "path": POLICY, "settings": claim}
     write_json(out / "policy.json", summary)
@@ -121,15 +98,18 @@ def train_from_recordings(
     return result
 
 
-def _cut(part: TrainingRecording, store: FrameStore, work: Path, report: Report) -> dict[str, int]:
-    """Extract the frames of a recording to a shard, once. Returns the numbers of skipped images."""
-    record = work / f"{_shard(part)}.json"
-    if _shard(part) not in store.names() or not record.is_file():
-        report(0.0, f"cutting {part.name}")
-        shutil.rmtree(store.folder / _shard(part), ignore_errors=True)
-        recording = part.cut()
+def _cut(
+    log: OpenLog, digest: str, view: PolicyView, expert: Expert, store: FrameStore, work: Path, report: Report
+) -> dict[str, int]:
+    """Extract the frames of a log to a shard, once. Returns the numbers of skipped images."""
+    shard = _shard(digest)
+    record = work / f"{shard}.json"
+    if shard not in store.names() or not record.is_file():
+        report(0.0, f"cutting {log.name}")
+        shutil.rmtree(store.folder / shard, ignore_errors=True)
+        recording = recorded_frames(log, view, expert)
         write_atomically(record, json.dumps(recording.counts) + "\n")
-        store.append(_shard(part), recording.frames)
+        store.append(shard, recording.frames)
     return {reason: int(count) for reason, count in read_json(record).items()}
 
 
@@ -170,8 +150,14 @@ def _clone(
     return save_policy(work / POLICY, policy, view, details), mae
 
 
-def _shard(part: TrainingRecording) -> str:
-    return f"recording-{part.digest}"
+def _shard(digest: str) -> str:
+    return f"recording-{digest}"
+
+
+def _digest_of(opened: OpenLog) -> str:
+    """Digest of a log's files and options. Where sizes or times of files change, it counts as another log."""
+    files = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in opened.log.files]
+    return _digest([opened.name, files, {**asdict(opened.choice), "labels": opened.labels}])
 
 
 def _digest(data: Any) -> str:

@@ -10,10 +10,11 @@ from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.learning.recipe import ImitationConfig
 from advnerf_core.policies.policy_file import load_policy
+from nodes.lab.policy_data import train as training
 from nodes.lab.policy_data.evaluate import compare, predict, saliency
 from nodes.lab.policy_data.frames import frames_of, view_for_size, view_of
-from nodes.lab.policy_data.logs import open_log
-from nodes.lab.policy_data.train import TrainingRecording, train_from_recordings
+from nodes.lab.policy_data.logs import OpenLog, open_log
+from nodes.lab.policy_data.recordings import recorded_frames
 from nodes.runtime.errors import ConfigError
 
 CHOICE = LogChoice("frame", "angle", 0.5, "right")
@@ -128,19 +129,21 @@ def test_a_policy_of_several_images_is_compared_in_the_order_of_the_recording():
     assert saliency(Slower(), images).shape == (4, 66, 200)
 
 
-def test_training_learns_is_kept_and_begins_anew_for_other_recordings(tmp_path):
+def test_training_learns_is_kept_and_begins_anew_for_other_recordings(tmp_path, monkeypatch):
     log = write_log(tmp_path)
     view = view_for_size(168, 94)
     cuts = []
 
-    def train(steps=8):
-        def cut():
-            cuts.append(1)
-            return frames_of(open_log(log, CHOICE), view, None, "recorded")
+    def cut(*given):
+        cuts.append(1)
+        return recorded_frames(*given)
 
-        parts = [TrainingRecording("log", (log,), {}, cut)]
+    monkeypatch.setattr(training, "recorded_frames", cut)
+
+    def train(steps=8):
+        logs = [OpenLog("log", CHOICE, open_log(log, CHOICE), "recorded")]
         config = ImitationConfig(first_steps=steps, batch_size=16, dagger_rounds=0)
-        return train_from_recordings(parts, view, EXPERT, config, tmp_path / "out")
+        return training.train_from_recordings(logs, view, EXPERT, config, tmp_path / "out")
 
     first = train()
     assert first.frames == {"log": 8}
