@@ -102,7 +102,6 @@ class CalibrationDrive(Node):
     @classmethod
     def build(cls, config: CalibrationDriveConfig, context: NodeContext) -> CalibrationDrive:
         """Build the node."""
-        del context
         return cls(program(config))
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:

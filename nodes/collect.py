@@ -77,7 +77,6 @@ class CollectNode(Node):
     @classmethod
     def build(cls, config: CollectConfig, context: NodeContext) -> CollectNode:
         """Build the node."""
-        del context  # not needed
         path = load_calibration(RoomCalibration, config.room).reference_path
         duration_s = config.laps * path.length_m / config.speed_mps
         poses = [start.pose_on(path) for start in config.starts]

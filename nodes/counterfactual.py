@@ -109,7 +109,6 @@ class CounterfactualNode(Node):
     @classmethod
     def build(cls, config: CounterfactualConfig, context: NodeContext) -> CounterfactualNode:
         """Build the node: load the policy twice, check it and warm it up."""
-        del context  # not needed
         cv2.setNumThreads(1)
         clean, attacked = (load_driver(config.policy, config.sha256 or None) for _ in range(2))
         return cls(config, clean, attacked)

@@ -135,7 +135,6 @@ class ExpertNode(Node):
     @classmethod
     def build(cls, config: ExpertNodeConfig, context: NodeContext) -> ExpertNode:
         """Build the node."""
-        del context  # not needed
         car = load_calibration(VehicleCalibration, config.vehicle)
         settings = ExpertConfig(
             wheelbase_m=car.wheelbase_m,

@@ -148,7 +148,6 @@ class MonitorNode(Node):
     @classmethod
     def build(cls, config: MonitorConfig, context: NodeContext) -> MonitorNode:
         """Open the screen and read the files."""
-        del context  # not needed
         target = load_calibration(TargetCalibration, config.target)
         attack = None if config.attack is None else load_attack(config.attack)
         display = _open(config.display)

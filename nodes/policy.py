@@ -90,7 +90,6 @@ class PolicyNode(Node):
     @classmethod
     def build(cls, config: PolicyNodeConfig, context: NodeContext) -> PolicyNode:
         """Build the node: load, check and warm up the policy."""
-        del context  # not needed
         # One thread: with one image at a time, more would take cores from the other nodes and add wake-up delays.
         cv2.setNumThreads(1)
         return cls(config, load_driver(config.policy, config.sha256 or None))

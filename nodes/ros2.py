@@ -124,7 +124,6 @@ class Ros2Node(Node):
     @classmethod
     def build(cls, config: Ros2Config, context: NodeContext) -> Ros2Node:
         """Build the node and join the ROS programs."""
-        del context  # not needed
         local = is_loopback_interface(config.interface)
         require_local(config, local)
         wheelbase_m = (

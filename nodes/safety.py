@@ -191,7 +191,6 @@ class SafetyNode(Node):
     @classmethod
     def build(cls, config: SafetyConfig, context: NodeContext) -> SafetyNode:
         """Build the node."""
-        del context  # not needed
         hand = HandGate(config.teleop == "hold", config.teleop_age_limit_s)
         clocks = ClockGate(config.clock_offset_limit_s, config.clock_error_limit_s, config.clock_peers)
         limits = config.limits(load_calibration(RoomCalibration, config.room))

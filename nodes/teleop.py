@@ -85,7 +85,6 @@ class TeleopNode(Node):
     @classmethod
     def build(cls, config: TeleopConfig, context: NodeContext) -> TeleopNode:
         """Build the node. Its keyboard is the terminal in which it was started."""
-        del context
         device: Keyboard | Gamepad
         if config.device == "keyboard":
             device = Keyboard(sys.stdin.fileno(), time.monotonic_ns)

@@ -82,7 +82,6 @@ class ViewerNode(Node):
     @classmethod
     def build(cls, config: ViewerConfig, context: NodeContext) -> ViewerNode:
         """Build the node and start the server."""
-        del context  # not needed
         return cls(config)
 
     @property

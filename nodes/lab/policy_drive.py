@@ -34,11 +34,9 @@ class _ClearSensor:
         self._see = see
 
     def initial_theta(self, generator: torch.Generator) -> Tensor:
-        del generator
         return torch.zeros(self.theta_shape)
 
     def sense(self, states: Tensor, theta: Tensor) -> Rendered:
-        del theta
         images = self._see(states)
         return Rendered(images, lambda grad: torch.zeros(self.theta_shape), images.nbytes)
 

@@ -78,7 +78,6 @@ class Node:
 
     def tick(self, now: Now) -> list[Out]:
         """Run a periodic step at `tick_rate_hz` on an absolute schedule. Missed ticks are skipped and counted."""
-        del now  # most nodes only react
         return []
 
     def status(self) -> tuple[str, str]:

@@ -184,7 +184,6 @@ class Photographs(Undriven):
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
         """Poses of the photographs, for any ``count``."""
-        del count, rng
         return [self._T_world_from_images @ each.T_world_from_camera for each in self._all]
 
     def __enter__(self) -> Photographs:
