@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import time
 from collections.abc import Iterator, Sequence
@@ -26,6 +27,7 @@ from hardware.cameras.v4l2.port import KernelPort, VideoPort, open_device
 from hardware.cameras.zed.calibration import Rectifier, load_factory_calibration
 from hardware.cameras.zed.exposure import ExtensionUnit, automatic_is_on, read_exposure_lines, read_gain
 from hardware.errors import HardwareError
+from nodes.lab.doctor.probes import oaks
 from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError
 
@@ -62,12 +64,8 @@ def describe_devices(port: VideoPort | None = None) -> Iterator[str]:
 
 def describe_oaks() -> Iterator[str]:
     """Yield one line for each OAK; none if depthai is not installed."""
-    try:
-        import depthai
-    except ImportError:
-        return
-    for info in depthai.Device.getAllAvailableDevices():
-        yield f"OAK {info.getDeviceId()} at {info.name} ({info.state.name})"
+    with contextlib.suppress(ImportError):
+        yield from (f"OAK {line}" for line in oaks())
 
 
 @dataclass(frozen=True)

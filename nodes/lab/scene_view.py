@@ -18,11 +18,16 @@ import numpy as np
 import torch
 import viser
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import ImageSet
-from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.geometry import (
+    Array,
+    Pinhole,
+    make_transform,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from advnerf_core.objects.voxel.model import load_object
 from advnerf_core.scene.surrogate import Surrogate
 from advnerf_core.splats.scene_file import load_renderer
@@ -214,15 +219,11 @@ def _stand_at(T: Array, event: Any) -> None:
 
 
 def _quaternion(T: Array) -> Array:
-    x, y, z, w = Rotation.from_matrix(np.asarray(T)[:3, :3]).as_quat()
-    return np.array([w, x, y, z])
+    return np.roll(quaternion_from_rotation(T[:3, :3]), 1)
 
 
 def _pose(wxyz: Array, position: Array) -> Array:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(wxyz[[1, 2, 3, 0]]).as_matrix()
-    T[:3, 3] = position
-    return T
+    return make_transform(rotation_from_quaternion(np.roll(wxyz, -1)), position)
 
 
 def _coloured(depth_m: Array) -> NDArray[np.uint8]:
