@@ -87,7 +87,7 @@ class PageNode(Node):
             self._operates,
         )
         self.inbox: Inbox[ClientAct | Gone] = Inbox(_INBOX)
-        self._operation = Operation(parts, self._answer)
+        self._operation = Operation(parts, lambda client, answer: self._server.answer(client, answer))
         recorders = [name for name in (RECORDER, LAUNCH_RECORDER) if self._operates and name not in nodes]
         statuses = tuple(map(status_topic, (*nodes, *recorders)))
         self.subscriptions = (config.camera_topic, _COMPOSITOR, *topics.TOPICS, *statuses)
@@ -227,9 +227,6 @@ class PageNode(Node):
         if self._operates and self._holds is False:
             return "the safety node does not wait for a held button; launch with --set safety.teleop=hold to drive from the page"
         return ""
-
-    def _answer(self, client: int, answer: dict[str, Any]) -> None:
-        self._server.answer(client, answer)
 
     def _png_of(self, attack_id: str) -> bytes | None:
         entry = self._catalogue.get(attack_id)

@@ -12,11 +12,14 @@ import secrets
 import time
 from collections import OrderedDict, deque
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from nodes.operator_page.pictures import Picture
 from nodes.operator_page.said import STOPS, Act, Hold, PictureSeen, Stop, Take, Wants, read_said
 from nodes.runtime.errors import MessageError, SecurityError
+
+if TYPE_CHECKING:
+    from starlette.websockets import WebSocket
 
 _CREDIT = 2
 _STAMPS_KEPT = 256
@@ -24,16 +27,6 @@ _MALFORMED_LIMIT = 100
 # A page sends about 20 answers to beats and 30 acknowledged pictures a second, and a person no ten acts.
 _RATE_HZ, _BURST = 120.0, 240.0
 _ACT_RATE_HZ, _ACT_BURST = 10.0, 40.0
-
-
-class Socket(Protocol):
-    """The part of a WebSocket that a client needs."""
-
-    async def send_text(self, data: str) -> None:
-        """Send a text message."""
-
-    async def send_bytes(self, data: bytes) -> None:
-        """Send a binary message."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +91,9 @@ class Client:
         name: Name of its person. Taking control gives a new one.
     """
 
-    def __init__(self, number: int, address: str, socket: Socket, session: str = "", name: str = "") -> None:
+    def __init__(
+        self, number: int, address: str, socket: WebSocket, session: str = "", name: str = ""
+    ) -> None:
         self.number, self.address, self._socket, self.session = number, address, socket, session
         self.name = name
         self.key = secrets.token_hex(16)

@@ -85,7 +85,7 @@ class Desk:
         if self.lease is not None and self.lease.client != client:
             if not session or self.lease.session != session:
                 return f"{self.lease.name} operates; one operator at a time"
-            self._end()
+            self.drop()
         if client != self._last_client:
             self._last_client, self._last_press = client, 0
         self.lease = Lease(client, name, session)
@@ -108,7 +108,7 @@ class Desk:
         if self.lease is None or self.lease.client != client:
             return False
         self.lease = None
-        return self._end()
+        return self.drop()
 
     def hold(self, client: int, beat: int, press: int, picture_ns: int, mono_ns: int) -> str:
         """Note that a client answered a beat while holding.
@@ -132,7 +132,7 @@ class Desk:
             return "the answer of the page is too old"  # it does not renew the hold, and `check` ends it
         if refusal := self._problem(picture_ns, mono_ns):
             self._last_press = max(self._last_press, press)
-            self._end()
+            self.drop()
             return refusal
         self._press = self._last_press = press
         self._answered_ns = max(self._answered_ns, sent_ns)
@@ -145,16 +145,17 @@ class Desk:
         if self.lease is None or self.lease.client != client:
             return False
         self._last_press = max(self._last_press, press)
-        return self._end()
+        return self.drop()
 
     def drop(self) -> bool:
         """End the current hold. Returns whether the button was held."""
-        return self._end()
+        held, self._press = self.held, None
+        return held
 
     def stop(self) -> bool:
         """Latch the e-stop. Returns whether the button was held."""
         self.estop = True
-        return self._end()
+        return self.drop()
 
     def reset(self, client: int) -> str:
         """Unlatch the e-stop. Returns why not; empty if it was done."""
@@ -175,7 +176,7 @@ class Desk:
             else:
                 ended = self._problem(self._picture_ns, mono_ns)
             if ended:
-                self._end()
+                self.drop()
             return ended
         if self.lease is not None and mono_ns - self._acted_ns > self.limits.lease_s * NS_PER_S:
             self.lease = None
@@ -196,7 +197,3 @@ class Desk:
         if age_s > self.limits.picture_age_limit_s:
             return f"the picture on the page is {age_s:.1f} s old"
         return ""
-
-    def _end(self) -> bool:
-        held, self._press = self.held, None
-        return held

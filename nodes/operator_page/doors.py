@@ -51,13 +51,11 @@ class Sessions:
 
     Attributes:
         code_s: Time for which a code is valid [s].
-        codes: Number of codes made.
         refused: Number of refused codes.
     """
 
     code_s: float = 300.0
     code: str = ""
-    codes: int = 0
     refused: int = 0
     _code_ns: int = 0
     _turn_ns: int = 0
@@ -71,7 +69,6 @@ class Sessions:
             return False
         self.code = "".join(secrets.choice(_LETTERS) for _ in range(_CODE_LENGTH))
         self._code_ns = mono_ns
-        self.codes += 1
         return True
 
     def wait_s(self, address: str, mono_ns: int) -> float:

@@ -230,14 +230,11 @@ class PageServer:
         from starlette.responses import JSONResponse
 
         entry = read_entry(await body_of(request))
-        ours = origin_is_ours(
-            request.headers.get("origin"), request.headers.get("host", ""), self.tls is not None
-        )
         token, host = "", request.client.host
         if entry is None:
             self.counts.refused += 1
             return JSONResponse({"open": False}, status_code=400)
-        if ours:
+        if self._from_page(request):
             with self._door_lock:
                 wait_s = self.doors.wait_s(host, time.monotonic_ns())
                 turn_s = 0.0 if wait_s else self.doors.turn_s(host, time.monotonic_ns())
@@ -260,9 +257,8 @@ class PageServer:
         """Stop the car for an admitted browser that has no WebSocket, for example because all places are taken."""
         from starlette.responses import JSONResponse
 
-        kind, host = request.path_params["kind"], request.headers.get("host", "")
-        ours = origin_is_ours(request.headers.get("origin"), host, self.tls is not None)
-        if not (ours and self._admitted(request) and kind in STOPS):
+        kind = request.path_params["kind"]
+        if not (self._from_page(request) and self._admitted(request) and kind in STOPS):
             self.counts.refused += 1
             return JSONResponse({"confirmed": False}, status_code=403)
         before, _ = self.stops()
@@ -284,8 +280,7 @@ class PageServer:
 
     async def _live(self, websocket: Any) -> None:
         """Serve one browser until it goes."""
-        host, origin = websocket.headers.get("host", ""), websocket.headers.get("origin")
-        if not (origin_is_ours(origin, host, self.tls is not None) and self._admitted(websocket)):
+        if not (self._from_page(websocket) and self._admitted(websocket)):
             self.counts.refused += 1
             await websocket.close(1008)
             return
@@ -332,6 +327,10 @@ class PageServer:
                     self.doors.rename(websocket.cookies[self._cookie], asked.name)
             if asked is not None:
                 self.inbox.put(asked, urgent=isinstance(asked.act, Stop))
+
+    def _from_page(self, connection: Any) -> bool:
+        headers = connection.headers
+        return origin_is_ours(headers.get("origin"), headers.get("host", ""), self.tls is not None)
 
     def _public(self, connection: Any) -> str:
         """Public name of a session."""
