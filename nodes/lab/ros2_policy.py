@@ -21,13 +21,15 @@ from nodes.linking.ros2.answers import OneWriter, stamp_of_cdr
 from nodes.linking.ros2.conversions import ACKERMANN, IMAGE, TWIST, Setting, conversion
 from nodes.linking.ros2.routes import Endpoint
 from nodes.linking.ros2.samples import Heard
-from nodes.linking.ros2.transports import Transport, is_loopback_interface, open_transport
+from nodes.linking.ros2.transports import Transport, open_transport
 from nodes.linking.ros2.zenoh_settings import ZenohSettings
-from nodes.runtime.errors import BusError, ConfigError
+from nodes.runtime.errors import BusError
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.messages import decode, encode, image_message
 
 _FIND_S, _ANSWER_S, _AGAIN_S, _POLL_S = 30.0, 10.0, 0.5, 0.0005
+# The loopback: a search sends thousands of queries and needs no network.
+_INTERFACE = "lo"
 
 
 class Ros2Network(nn.Module):
@@ -39,7 +41,6 @@ class Ros2Network(nn.Module):
         commands: ROS name of its commands.
         command_type: ``geometry_msgs/msg/TwistStamped`` or ``ackermann_msgs/msg/AckermannDriveStamped``.
         wheelbase_m: Distance of the axles, which turns yaw rates into wheel angles [m].
-        interface: A loopback interface: a search sends thousands of queries and needs no network.
         transport: ``dds``, ``zenoh`` or ``auto``, as in the configuration of the ROS 2 node.
     """
 
@@ -50,18 +51,15 @@ class Ros2Network(nn.Module):
         commands: str,
         command_type: str,
         wheelbase_m: float,
-        interface: str = "lo",
         transport: Transport = "auto",
     ) -> None:
         super().__init__()
-        if not is_loopback_interface(interface):
-            raise ConfigError(f"expected a loopback interface to ask a ROS 2 policy, got {interface}; use lo")
         self._names, self._type, self._setting = (images, commands), command_type, Setting(wheelbase_m)
         self._inbox: Inbox[list[Heard]] = Inbox(100)
         self._side = open_transport(
             transport,
             domain_id,
-            interface,
+            _INTERFACE,
             ZenohSettings(),
             [Endpoint(images, IMAGE, reliable=True, depth=5)],
             [Endpoint(commands, command_type, reliable=True, depth=10)],
