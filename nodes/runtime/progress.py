@@ -99,13 +99,20 @@ class ProgressDisplay:
     def start(self, stage: str) -> MeasuringReport:
         """Start a stage and return its progress callback."""
         shown = self._shown(stage)
-        return shown if self._watcher is None else _BothReports(shown, self._watcher.start(stage))
+        watched = None if self._watcher is None else self._watcher.start(stage)
 
-    def _shown(self, stage: str) -> MeasuringReport:
+        def report(fraction: float, text: str = "", point: Point | None = None) -> None:
+            shown(fraction, text)
+            if watched is not None:
+                watched(fraction, text, point)
+
+        return report
+
+    def _shown(self, stage: str) -> Report:
         if self._progress is None:
             self._console.print(f"{stage}: started", highlight=False, markup=False, soft_wrap=True)
             return _LogReport(self._console, stage)
-        return _BarReport(self._progress, self._progress.add_task("", total=1.0, stage=stage, text=""))
+        return _bar(self._progress, self._progress.add_task("", total=1.0, stage=stage, text=""))
 
     def finish(self, stage: str, seconds: float, cached: bool) -> None:
         """Finish a stage, or report that its earlier result is reused."""
@@ -115,21 +122,11 @@ class ProgressDisplay:
             self._watcher.finish(stage, seconds, cached)
 
 
-class _BothReports:
-    def __init__(self, first: MeasuringReport, second: MeasuringReport) -> None:
-        self._reports = (first, second)
+def _bar(progress: Progress, task: TaskID) -> Report:
+    def report(fraction: float, text: str = "") -> None:
+        progress.update(task, completed=min(max(fraction, 0.0), 1.0), text=text)
 
-    def __call__(self, fraction: float, text: str = "", point: Point | None = None) -> None:
-        for report in self._reports:
-            report(fraction, text, point)
-
-
-class _BarReport:
-    def __init__(self, progress: Progress, task: TaskID) -> None:
-        self._progress, self._task = progress, task
-
-    def __call__(self, fraction: float, text: str = "", point: Point | None = None) -> None:
-        self._progress.update(self._task, completed=min(max(fraction, 0.0), 1.0), text=text)
+    return report
 
 
 class _LogReport:
@@ -137,7 +134,7 @@ class _LogReport:
         self._console, self._stage = console, stage
         self._begin_s = self._printed_s = time.monotonic()
 
-    def __call__(self, fraction: float, text: str = "", point: Point | None = None) -> None:
+    def __call__(self, fraction: float, text: str = "") -> None:
         now_s = time.monotonic()
         if now_s - self._printed_s < LOG_PERIOD_S:
             return
