@@ -70,11 +70,6 @@ class CameraNodeConfig(StrictModel):
     compressed: CompressedConfig | None = None
 
 
-def _grid(compressed: CompressedConfig | None) -> Decimator | None:
-    # A frame may arrive up to a quarter of a period early.
-    return None if compressed is None else Decimator(compressed.rate_hz, 2.0 * compressed.rate_hz)
-
-
 class CameraNode(Node):
     """Publishes frames as images and camera infos."""
 
@@ -93,7 +88,9 @@ class CameraNode(Node):
             *((COMPRESSED_TOPIC,) if config.compressed else ()),
         )
         self._subscribers = subscribers
-        self._grid = _grid(config.compressed)
+        if config.compressed is not None:
+            # A frame may arrive up to a quarter of a period early.
+            self._grid = Decimator(config.compressed.rate_hz, 2.0 * config.compressed.rate_hz)
         self._device = device or config.source.steady()
         self._factory: Pinhole | None = None
         # Two: the newest frame, and the one that the loop is taking.
@@ -154,9 +151,7 @@ class CameraNode(Node):
     def _compressed(self, frame: Frame, stamp_ns: int) -> list[Out]:
         """Encode a frame as JPEG with the same stamp. Empty without subscribers, or if the frame is too early for the rate."""
         wanted = self._config.compressed
-        if wanted is None or self._grid is None or self._subscribers(COMPRESSED_TOPIC) == 0:
-            return []
-        if self._grid.slot(stamp_ns) is None:
+        if wanted is None or not self._subscribers(COMPRESSED_TOPIC) or self._grid.slot(stamp_ns) is None:
             return []
         return [
             Out(COMPRESSED_TOPIC, compressed_image_message(frame.rgb, stamp_ns, FRAME_ID, wanted.quality))

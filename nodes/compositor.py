@@ -135,7 +135,6 @@ class CompositorNode(Node):
     @classmethod
     def build(cls, config: CompositorConfig, context: NodeContext) -> CompositorNode:
         """Build the node."""
-        del context  # not needed
         camera = load_calibration(CameraCalibration, config.camera)
         target = load_calibration(TargetCalibration, config.target)
         return cls(config, camera, target, None if config.attack is None else load_attack(config.attack))
@@ -268,10 +267,5 @@ def show(
     return Showing(attack.attack_id, overlay, camera.mount)
 
 
-def main() -> None:
-    """Run the node as a process."""
-    raise SystemExit(run_node_main(CompositorConfig, CompositorNode.build))
-
-
 if __name__ == "__main__":
-    main()
+    raise SystemExit(run_node_main(CompositorConfig, CompositorNode.build))

@@ -22,10 +22,6 @@ from nodes.runtime.twin_port import claim_twins_port
 RESET_TOPIC = "/twin/reset"
 
 
-class TwinConfig(LiveLabConfig):
-    """Configuration of the twin node; see `hardware.emulators.live.LiveLabConfig`."""
-
-
 class TwinNode(Node):
     """Runs the simulated lab."""
 
@@ -38,7 +34,7 @@ class TwinNode(Node):
         self._resets = self._refused = 0
 
     @classmethod
-    def build(cls, config: TwinConfig, context: NodeContext) -> TwinNode:
+    def build(cls, config: LiveLabConfig, context: NodeContext) -> TwinNode:
         """Build the lab. Returns when its devices are available."""
         # Before the serial port exists: a motor node may open it at once, and must see whose it is.
         claim = claim_twins_port(context.run_dir)
@@ -79,4 +75,4 @@ class TwinNode(Node):
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_node_main(TwinConfig, TwinNode.build))
+    raise SystemExit(run_node_main(LiveLabConfig, TwinNode.build))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -65,7 +66,7 @@ def doctor(
             _print(finding)
     state = worst(findings)
     if as_json:
-        print(json.dumps({"state": state, "findings": [finding.to_dict() for finding in findings]}, indent=1))
+        print(json.dumps({"state": state, "findings": [asdict(finding) for finding in findings]}, indent=1))
     else:
         counts = {word: sum(finding.state == word for finding in findings) for word in ("failure", "warning")}
         print(", ".join(f"{count} {word}{'s' * (count != 1)}" for word, count in counts.items()))

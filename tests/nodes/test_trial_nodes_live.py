@@ -2,6 +2,7 @@
 
 import os
 import signal
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -34,7 +35,7 @@ def test_nodes_are_started_once_for_drives_with_and_without_an_attack_and_again_
         plan = TrialPlan(start, 1.0, NODES)
 
         def once():
-            outcome = nodes.drive([*shared, *more], plan, tmp_path / name).to_dict()
+            outcome = asdict(nodes.drive([*shared, *more], plan, tmp_path / name))
             seen.append((nodes.starts, nodes.pids))
             return outcome
 

@@ -206,7 +206,7 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path, nodes: LiveN
     result: dict[str, Any] = {
         "victim": live.victim,
         "attack_ids": drawn,
-        "outcome": outcome.to_dict(),
+        "outcome": asdict(outcome),
         "states": held.tolist(),
         "cte_m": path.project(held[:, :2]).cte_m.tolist(),
         "metrics": asdict(metrics),

@@ -7,7 +7,7 @@ import subprocess
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from advnerf_core.errors import AdvnerfError
@@ -35,10 +35,6 @@ class CheckResult:
     state: str
     found: str
     do: str = ""
-
-    def to_dict(self) -> dict[str, str]:
-        """Convert to plain data."""
-        return asdict(self)
 
 
 def report(check: str, state: str, found: str, do: str = "") -> list[CheckResult]:

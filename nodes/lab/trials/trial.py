@@ -8,7 +8,7 @@ and waits.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
@@ -87,10 +87,6 @@ class TrialOutcome:
     stopped_early: str = ""
     peer: str = ""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Convert to plain data."""
-        return asdict(self)
-
 
 @dataclass
 class _NewestMessages:
@@ -135,7 +131,6 @@ class TrialNode(Node):
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Note a message. A pose of the car is handled at once."""
-        del info
         if topic == "/vicon/car":
             self._see_car(message, now)
         elif topic == "/safety/state":

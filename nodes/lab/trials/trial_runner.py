@@ -6,6 +6,7 @@ import contextlib
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from advnerf_core.files import write_json
@@ -175,7 +176,7 @@ def _counted(launch: Launch, outcome: TrialOutcome, folder: Path) -> TrialOutcom
     )
     if spoiled := spoiled_by(health):
         raise SpoiledError(spoiled)
-    write_json(folder / "trial.json", outcome.to_dict())
+    write_json(folder / "trial.json", asdict(outcome))
     return outcome
 
 

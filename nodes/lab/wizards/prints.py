@@ -123,13 +123,13 @@ def measure(
     """
     sheet = printed_sheet(record, attack)
     if source.is_file() and source.suffix.lower() in PICTURES:
-        mounted = None if known.car is None else _camera_with_mount(camera)
-        return _measure_photograph(source, record, sheet, mounted or load_lens(camera), known)
+        lens = load_lens(camera) if known.car is None else load_calibration(CameraCalibration, camera)
+        return _measure_photograph(source, record, sheet, lens, known)
     if known != KnownLength():
         raise CalibrationError(
             f"expected no --card, --distance, --width or --car with a bag, whose poses give the size, got {source}; leave them out"
         )
-    return _measure_drive(source, record, sheet, _camera_with_mount(camera))
+    return _measure_drive(source, record, sheet, load_calibration(CameraCalibration, camera))
 
 
 def write_measured(found: MeasuredPrint, effect: PlainData | None, path: Path) -> list[Path]:
@@ -241,10 +241,6 @@ def _camera_in_world(lens: Intrinsics, known: KnownLength) -> Array | None:
     if known.car is None or not isinstance(lens, CameraCalibration):
         return None
     return planar_pose(*known.car) @ lens.mount
-
-
-def _camera_with_mount(file: Path) -> CameraCalibration:
-    return load_calibration(CameraCalibration, file)
 
 
 def _with_colours(

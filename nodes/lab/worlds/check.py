@@ -37,8 +37,8 @@ from nodes.runtime.errors import ConfigError
 from nodes.runtime.findings import CheckFinding, NotMet, look
 
 _DESCRIPTION = "description"
-# Without the first of these the others cannot run.
-_FIRST: tuple[tuple[str, Check], ...] = (("pictures", form),)
+# Without it the others cannot run.
+_FIRST = "pictures"
 _CHECKS: tuple[tuple[str, Check], ...] = (
     ("repeatable", repeats),
     ("time", takes_no_time),
@@ -78,7 +78,7 @@ def check_world(
         AdvnerfError: The world cannot be made or opened; its own message.
         ConfigError: No part has this name.
     """
-    names = (_DESCRIPTION, *(name for name, _ in (*_FIRST, *_CHECKS, *(each for _, each in _NATIVE))))
+    names = (_DESCRIPTION, _FIRST, *(name for name, _ in (*_CHECKS, *(each for _, each in _NATIVE))))
     for name in only:
         if name not in names:
             raise ConfigError(unknown(name, "part of the contract", names))
@@ -95,10 +95,9 @@ def check_world(
             )
         )
         bench = WorldBench(named, world, described, traits_of(world).step_s)
-        for name, check in _FIRST:
-            findings.append(look(name, check, bench, _OF_THE_WORLD))
-            if not findings[-1].met:
-                return findings
+        findings.append(look(_FIRST, form, bench, _OF_THE_WORLD))
+        if not findings[-1].met:
+            return findings
         if pictures is not None:
             _write_pictures(bench, pictures)
         wanted = (*_CHECKS, *(each for kind, each in _NATIVE if isinstance(world, kind)))

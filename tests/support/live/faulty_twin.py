@@ -12,13 +12,13 @@ import threading
 import numpy as np
 
 from advnerf_core.geometry import Array, make_transform
-from hardware.emulators.live import LiveLab
+from hardware.emulators.live import LiveLab, LiveLabConfig
 from hardware.emulators.vicon_emulator import ViconEmulator
 from nodes.runtime.node import NodeContext
 from nodes.runtime.paths import bus_folder
 from nodes.runtime.process import run_node_main
 from nodes.runtime.twin_port import claim_twins_port
-from nodes.twin import TwinConfig, TwinNode
+from nodes.twin import TwinNode
 
 # To the side, and inside the fence of the track's straights: the pose check must stop the car, not the fence.
 _ELSEWHERE = make_transform(np.eye(3), [0.0, 0.1, 0.0])
@@ -77,7 +77,7 @@ def _listen(lab: FaultyLab) -> None:
         print("ok", flush=True)
 
 
-def build(config: TwinConfig, context: NodeContext) -> TwinNode:
+def build(config: LiveLabConfig, context: NodeContext) -> TwinNode:
     """The twin node, with a thread that obeys standard input."""
     claim = claim_twins_port(context.run_dir)
     lab = LiveLab(config, context.run_dir, bus_folder(context.run_dir))
@@ -86,4 +86,4 @@ def build(config: TwinConfig, context: NodeContext) -> TwinNode:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_node_main(TwinConfig, build))
+    raise SystemExit(run_node_main(LiveLabConfig, build))
