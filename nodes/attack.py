@@ -58,11 +58,7 @@ class AttackNodeConfig(StrictModel):
 
 
 class AttackNode(Node):
-    """Takes requests; publishes progress, pictures and the attack file.
-
-    Args:
-        subscribers: Number of subscribers of a topic.
-    """
+    """Takes requests; publishes progress, pictures and the attack file."""
 
     subscriptions = (_REQUEST, _CANCEL)
     publications = (_PROGRESS, *_IMAGES.values(), _FILE)

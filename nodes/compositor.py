@@ -72,13 +72,7 @@ class CompositorConfig(StrictModel):
 
 @dataclass(frozen=True, eq=False)
 class Showing:
-    """The attack to draw, prepared for a camera.
-
-    Attributes:
-        attack_id: Short hash of the attack file.
-        overlay: Draws the face.
-        T_car_from_camera: Pose of the camera on the car.
-    """
+    """The attack to draw, prepared for a camera."""
 
     attack_id: str
     overlay: FaceOverlay
@@ -96,9 +90,6 @@ class CompositorNode(Node):
     """Joins images with poses and draws the face. See the module's docstring.
 
     Args:
-        config: Configuration.
-        camera: Camera calibration.
-        target: Calibration of the face.
         attack: The attack to draw; None passes images through.
     """
 

@@ -75,7 +75,6 @@ class CounterfactualNode(Node):
     """Joins both images by their stamp and runs the policy on each. See the module's docstring.
 
     Args:
-        config: Configuration.
         clean: The policy for the camera's images.
         attacked: A second instance of the same policy for the compositor's images, because a policy may have a state.
     """

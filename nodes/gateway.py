@@ -83,12 +83,7 @@ class GatewayConfig(StrictModel):
 
 
 class GatewayNode(Node):
-    """Carries messages between the bus of this host and the link.
-
-    Args:
-        config: Configuration.
-        subscribers: Returns the number of subscribers of a topic on this host.
-    """
+    """Carries messages between the bus of this host and the link."""
 
     raw = True
     tick_rate_hz = _TICK_HZ

@@ -111,11 +111,7 @@ class MonitorNode(Node):
     """Shows the attack or the plain face. See the module's docstring.
 
     Args:
-        config: Configuration.
         display: The open screen, which the node closes.
-        panel: Size of the panel.
-        target: Calibration with the corners of the panel.
-        attack: The attack; None for none.
     """
 
     publications = ("/monitor/attack", "/monitor/shown")

@@ -85,7 +85,6 @@ class MotorNode(Node):
     """Connects the command gate with the controller, and reports the commands that were sent.
 
     Args:
-        config: Configuration.
         make_vesc: Makes a driver that is not open yet.
         wheelbase_m: Distance between the axles, for odometry [m].
         mono_ns: Monotonic time at the start [ns].

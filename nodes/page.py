@@ -49,12 +49,7 @@ FOLDER, DOOR, LOG = "page", "page/door.json", "page/acts.jsonl"
 
 
 class PageNode(Node):
-    """Connects the bus, the desk and the web server.
-
-    Args:
-        config: Configuration.
-        run_dir: Folder of the run.
-    """
+    """Connects the bus, the desk and the web server."""
 
     tick_rate_hz = _TICK_HZ
 

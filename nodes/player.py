@@ -71,8 +71,6 @@ class PlayerNode(Node):
     """Publishes the messages of a bag when they are due.
 
     Args:
-        config: Configuration.
-        subscribers: Number of subscribers of a topic.
         terminal: File descriptor of a terminal whose keys control the player; None for no keys.
     """
 

@@ -57,12 +57,7 @@ class PolicyNodeConfig(StrictModel):
 
 
 class PolicyNode(Node):
-    """Turns images into drive commands.
-
-    Args:
-        config: Configuration.
-        driver: The policy with its view.
-    """
+    """Turns images into drive commands."""
 
     publications = (_DRIVE,)
     tick_rate_hz = 10.0

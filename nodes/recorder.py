@@ -50,7 +50,6 @@ class RecorderNode(Node):
     """Writes received bytes to a bag without decoding.
 
     Args:
-        topics: Topics to subscribe to.
         queue: Messages that may wait per topic.
     """
 

@@ -80,9 +80,6 @@ class Ros2Node(Node):
     """Carries messages between the bus of this host and ROS 2.
 
     Args:
-        config: Configuration.
-        inbox: Queue of batches from the transport.
-        wheelbase_m: Distance of the axles [m].
         on_this_host: Whether every publisher runs on this computer, so that its clock is ours.
         instance: Random text of this process. A restart of this node counts as a restart of the publishers.
     """

@@ -147,14 +147,7 @@ class SafetyConfig(StrictModel):
 
 
 class SafetyNode(Node):
-    """Connects the arming state machine to the bus.
-
-    Args:
-        limits: Limits of the checks.
-        poses: The check of the car's poses.
-        hand: The check of the held button.
-        clocks: The check of other hosts' clocks.
-    """
+    """Connects the arming state machine to the bus."""
 
     publications = ("/safety/drive", "/safety/state")
     tick_rate_hz = _TICK_RATE_HZ

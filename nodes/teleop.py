@@ -59,9 +59,7 @@ class TeleopNode(Node):
     """Publishes the state of the operator's input.
 
     Args:
-        config: Configuration.
         read: Blocks for a bounded time and returns the input.
-        release: Releases the device.
     """
 
     subscriptions = ("/safety/state", "/motor/sent")

@@ -42,11 +42,7 @@ class ViewerConfig(StrictModel):
 
 
 class ViewerNode(Node):
-    """Forwards CDR bytes to a WebSocket without decoding.
-
-    Args:
-        config: Configuration.
-    """
+    """Forwards CDR bytes to a WebSocket without decoding."""
 
     raw = True
 

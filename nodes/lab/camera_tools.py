@@ -73,12 +73,9 @@ class SourceTrial:
     """Measurements of a camera source.
 
     Attributes:
-        frames: Number of received frames.
-        rate_hz: Frames per second.
         missed: Number of missing frames, by frame numbers.
         age_ms: Age of the frames on arrival: median and worst [ms].
         brightness: Mean of all pixels of the last frame, 0 to 255.
-        counters: Counters of device and driver.
     """
 
     frames: int

@@ -102,7 +102,6 @@ class MethodBench:
         Args:
             state: Name of its state file; empty for none.
             stop_after: Evaluations after which it is killed; 0 for never.
-            settings_hash: Hash of the settings that must stay the same.
             problem: The attack problem; a fresh one if None.
         """
         told: list[Evaluation] = []

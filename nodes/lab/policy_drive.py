@@ -48,9 +48,7 @@ def drive_round(
 
     Args:
         policy: A policy in eval mode.
-        see: Renders the policy's images.
         room: Path, fence and off-track limit.
-        goal: Goal vector of a goal-conditioned policy.
     """
     path, count = room.reference_path, _STARTS
     starts = torch.from_numpy(path.pose_at(np.arange(count) / count * path.length_m))

@@ -48,7 +48,6 @@ class ReferenceFrames:
     Attributes:
         images: Policy images ``[N, H, W, 3]`` uint8 RGB.
         steering_rad: The expert's steering ``[N]`` [rad], left positive; None if it is not known.
-        source: Origin of the frames, as text.
         drives: Drives a policy without an attack in the place of the frames; None if it cannot be driven, as for a bag.
         asked: Whether the user named this place. If so, a policy that does not drive there fails.
     """
@@ -160,9 +159,7 @@ def from_scene(scene: Path, calibration: Path, view: PolicyView, count: int = 48
     """Render reference frames of a learned scene around the path of a room, and drives in it.
 
     Args:
-        scene: Scene file.
         calibration: Folder with ``camera.yaml``, ``room.yaml`` and ``vehicle.yaml``.
-        count: Number of frames.
     """
     _camera(view, calibration)
     expert = Expert(load_calibration(RoomCalibration, calibration / "room.yaml").reference_path)

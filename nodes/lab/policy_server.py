@@ -46,7 +46,6 @@ class ServedCar:
     Attributes:
         wheelbase_m: Distance between the axles, which converts a wheel angle to an arc [m]; None for a policy without need of it.
         speed_mps: Speed of the plans [m/s]; None for the car's current speed.
-        goal: Goal vector of a goal-conditioned policy.
     """
 
     wheelbase_m: float | None = None
@@ -58,9 +57,7 @@ class ServedPolicy(BaseDriver):
     """A policy as a driver of the protocol.
 
     Args:
-        driver: The policy.
         name: Name of the driver; the start of the policy's hash follows.
-        car: Data of the car.
 
     Raises:
         ConfigError: The policy steers and the wheelbase is missing, or its goal has another length.
@@ -167,7 +164,6 @@ def serving(policy: BaseDriver, listen: str, mode: ServiceMode = "carla") -> Ite
     """Serve a policy while the block runs; yields the address for clients.
 
     Args:
-        policy: The policy as a driver.
         listen: ``HOST:PORT``; port 0 takes a free one. On an address that other computers reach, TLS with this user's certificate.
         mode: ``alpasim`` for a runtime of alpasim itself, whose opaque fields differ.
 

@@ -57,7 +57,6 @@ class Driven:
     Attributes:
         states: States at the ticks ``[T + 1, 3]``: x [m], y [m], yaw [rad].
         pictures: What the policy saw, ``[T + 1, H, W, 3]``.
-        metrics: Its metrics over the horizon.
         where: What drove, in words.
     """
 
@@ -71,9 +70,7 @@ def drive_recorded(victim: RecordedVictim, folder: Path, say: Callable[[str], No
     """Drive the recorded victim; pictures of the drive are written as they come.
 
     Args:
-        victim: The victim.
         folder: Folder for picture, film and description.
-        say: Called with messages.
 
     Returns:
         The film.

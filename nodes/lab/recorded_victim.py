@@ -33,7 +33,6 @@ class RecordedVictim:
     """A policy and an attack on it.
 
     Attributes:
-        policy: Policy file.
         attack: Attack file of the lab's board.
     """
 

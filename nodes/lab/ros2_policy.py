@@ -36,12 +36,8 @@ class Ros2Network(nn.Module):
     """Queries a ROS 2 program for the steering of images, one after the other.
 
     Args:
-        domain_id: ``ROS_DOMAIN_ID`` of the program.
-        images: ROS name of the images.
-        commands: ROS name of its commands.
         command_type: ``geometry_msgs/msg/TwistStamped`` or ``ackermann_msgs/msg/AckermannDriveStamped``.
         wheelbase_m: Distance of the axles, which turns yaw rates into wheel angles [m].
-        transport: ``dds``, ``zenoh`` or ``auto``, as in the configuration of the ROS 2 node.
     """
 
     def __init__(

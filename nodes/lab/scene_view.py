@@ -45,11 +45,9 @@ class SceneView:
     """A web server that shows a scene.
 
     Args:
-        scene: Scene file.
         cameras: ``transforms.json`` whose cameras and images are shown, or None.
         objects: Object files, placed at the world's origin in their own colours.
         room: Room calibration whose path is drawn, or None.
-        host: Address to listen on.
         port: Preferred port; the next free one is used.
     """
 

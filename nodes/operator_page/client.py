@@ -35,7 +35,6 @@ class ClientAct:
 
     Attributes:
         client: Number of the connection.
-        address: Address of the browser.
         frame_ns: Capture stamp of the newest picture on its screen [ns]; 0 without one.
         picture_ns: When the node received that picture, monotonic [ns]; 0 without one.
         session: Public name of the browser's session.
@@ -53,11 +52,7 @@ class ClientAct:
 
 @dataclass(frozen=True)
 class Gone:
-    """A browser has gone.
-
-    Attributes:
-        client: Number of the connection.
-    """
+    """A browser has gone."""
 
     client: int
 
@@ -86,7 +81,6 @@ class Client:
 
     Args:
         number: Number of the connection.
-        address: Address of the browser.
         session: Public name of the browser's session.
         name: Name of its person. Taking control gives a new one.
     """

@@ -24,7 +24,6 @@ class Lease:
 
     Attributes:
         client: Number of the connection that has it.
-        name: Name that the operator gave.
         session: Session of the browser; another connection of the same session may take over.
     """
 
@@ -35,9 +34,6 @@ class Lease:
 
 class Desk:
     """Decides who operates and whether the button counts as held.
-
-    Args:
-        limits: Configuration, with the time limits.
 
     Attributes:
         lease: The current lease; None while the desk is free.
@@ -114,11 +110,9 @@ class Desk:
         """Note that a client answered a beat while holding.
 
         Args:
-            client: Number of the connection.
             beat: Number of the beat that it answers.
             press: Number of the press, larger for every new one.
             picture_ns: Time at which the node received the picture on the client's screen [ns]; 0 without one.
-            mono_ns: Current time [ns].
 
         Returns:
             Why the button does not count as held; empty if it does.

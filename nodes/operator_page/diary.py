@@ -21,7 +21,6 @@ class Diary:
 
     Args:
         file: The log. An existing one is continued.
-        disk: Writes it.
     """
 
     def __init__(self, file: Path, disk: DiskWriter) -> None:
@@ -41,9 +40,6 @@ class Diary:
         """Note an act. It is written to the log soon.
 
         Args:
-            now: Current time.
-            operator: Name of the operator.
-            address: Address of the browser.
             frame_ns: Capture stamp of the newest picture that the operator saw [ns].
             answer: Why the act was refused; empty if it was granted.
         """

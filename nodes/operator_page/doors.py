@@ -51,7 +51,6 @@ class Sessions:
 
     Attributes:
         code_s: Time for which a code is valid [s].
-        refused: Number of refused codes.
     """
 
     code_s: float = 300.0

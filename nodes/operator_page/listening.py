@@ -19,7 +19,6 @@ def bound_socket(host: str, port: int) -> socket.socket:
     """A socket that holds the page's address.
 
     Args:
-        host: Address to listen on.
         port: TCP port; 0 selects a free one.
 
     Raises:

@@ -48,7 +48,6 @@ class Parts:
         desk: Lease, button and e-stop.
         recording: The recorder that the operator starts.
         catalogue: Attacks by id.
-        launched: Facts of the launch.
         start_pose: Start of a trial: x [m], y [m], yaw [rad]; None without a room.
         operates: Whether the page may do more than show and stop the car.
     """

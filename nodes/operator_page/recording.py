@@ -21,7 +21,6 @@ class RecorderControl:
     """Starts and stops a recorder process.
 
     Args:
-        run_dir: Folder of the run.
         nodes: Nodes whose status is recorded too.
     """
 

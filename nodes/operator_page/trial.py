@@ -25,7 +25,6 @@ class Trial:
         path: Reference path; None leaves out the metrics.
         off_track_m: Cross-track error beyond which the car is off the track [m].
         ticks: Length in control ticks.
-        dt_s: Time between two ticks [s].
     """
 
     def __init__(
@@ -55,10 +54,8 @@ class Trial:
         """Continue the trial. Returns whether it has just ended.
 
         Args:
-            armed: Whether the car is armed.
             position_m: Position of the rear axle [m]; None while unknown.
             attack_id: The attack that is drawn now; empty for none.
-            mono_ns: Current time [ns].
             reason: Why the car is not armed.
         """
         if self.phase == WAITING and armed and position_m is not None:

@@ -36,7 +36,6 @@ def ask(
 
     Args:
         bus: A bus of the calling thread. Messages of its other subscriptions that arrive meanwhile are also passed to `read`.
-        topic: Topic of the request.
         make: Makes the message for one repeat from the identity of the request and the time.
         answers: Topic on which the node answers.
         read: Returns the answer if a received message answers this id, else None.

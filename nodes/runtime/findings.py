@@ -39,7 +39,6 @@ def look(
     """The finding of one check.
 
     Args:
-        name: Part of the contract.
         check: Returns what was found, or raises `NotMet`.
         lets_through: Errors that end the whole report. Any other error is a part that is not met.
     """

@@ -24,7 +24,6 @@ class Schedule:
     """Due times of a periodic task on an absolute grid. After a stall, missed ticks are skipped instead of run in a burst.
 
     Args:
-        rate_hz: Rate of the task [Hz].
         start_ns: First due time on the monotonic clock [ns].
     """
 

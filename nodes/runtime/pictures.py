@@ -34,7 +34,6 @@ def compressed_image_message(rgb: NDArray[np.uint8], stamp_ns: int, frame_id: st
 
     Args:
         stamp_ns: Capture time, real time [ns].
-        frame_id: Frame of the camera.
         quality: JPEG quality, 1 to 100.
     """
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
@@ -69,12 +68,7 @@ def rgb_image(message: Any, source: str) -> NDArray[np.uint8]:
 
 
 def rgb8_message(message: Any, source: str) -> Any:
-    """Convert an image message to a ``sensor_msgs/Image`` in rgb8 with the same stamp and frame. An rgb8 image is returned as is.
-
-    Args:
-        message: An ``Image`` or a ``CompressedImage``.
-        source: Origin of the image for error messages.
-    """
+    """Convert an image message to a ``sensor_msgs/Image`` in rgb8 with the same stamp and frame. An rgb8 image is returned as is."""
     rgb = rgb_image(message, source)
     if type_name(message) == IMAGE_TYPE and message.encoding == _RGB8:
         return message

@@ -66,7 +66,6 @@ def nices_to_try(nice: int, current: int, limit: int) -> list[int]:
     """Return the values to try, best first. A helper is never raised, and a node that stops the car is never lowered.
 
     Args:
-        current: The value of the process.
         limit: RLIMIT_NICE: without the privilege a process may go as far as 20 minus this limit (setrlimit(2)).
     """
     if nice >= 0:

@@ -45,7 +45,6 @@ def counted(report: Report, what: str, count: int, before: int, total: int) -> C
     """Make a callback for a loop that reports how many of its ``count`` items are done, as one part of a stage.
 
     Args:
-        report: Progress callback of the stage.
         what: Name of the part.
         count: Number of items of the part.
         before: Number of items of the stage before the part.

@@ -26,7 +26,6 @@ class StopReport:
     """Knowledge about the stop of one run.
 
     Attributes:
-        run_dir: Folder of the run.
         waited_s: Time since the first request [s].
         answer: Answer of the safety node; None before it answers.
         trouble: Why the request cannot be sent; empty if it can.
@@ -39,12 +38,7 @@ class StopReport:
 
 
 class StopRequest:
-    """A request to disarm one run, repeated until it is answered.
-
-    Args:
-        run_dir: Folder of the run.
-        reason: Reason to record.
-    """
+    """A request to disarm one run, repeated until it is answered."""
 
     def __init__(self, run_dir: Path, reason: str) -> None:
         self.run_dir, self._reason = run_dir, reason
@@ -111,8 +105,6 @@ def stop_runs(run_dirs: Sequence[Path], reason: str, tell: Callable[[StopReport]
     """Disarm all runs at the same time, each until its safety node has answered.
 
     Args:
-        run_dirs: Folders of the runs.
-        reason: Reason to record.
         tell: Called once for each run with its answer or its trouble, and before, with neither, while there is no answer.
     """
     requests: list[StopRequest] = []

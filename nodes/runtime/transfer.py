@@ -71,8 +71,6 @@ class ReceivedFile:
 
     Attributes:
         name: Name that the sender gave the file.
-        sha256: Hash of the content.
-        content: Bytes of the file.
     """
 
     name: str
@@ -94,10 +92,6 @@ class Assembler:
 
     def add(self, chunk: Any, instance_id: int) -> tuple[ReceivedFile | None, str]:
         """Add a piece.
-
-        Args:
-            chunk: A ``FileChunk``.
-            instance_id: Instance id of the publisher.
 
         Returns:
             The file if this was its last piece, else None; and the error of a transfer, or an empty text.

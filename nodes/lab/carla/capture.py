@@ -46,7 +46,6 @@ def capture(
 
     Args:
         folder: Output folder; an error if it holds another capture.
-        report: Called with the finished share and the current step.
         library: The ``carla`` module; None imports it.
 
     Returns:

@@ -76,7 +76,6 @@ def source(
     Args:
         config: One of `hardware.cameras.sources`.
         calibration: Calibration that the images must fit; None if it cannot be read.
-        timeout_s: Longest time to wait for the frames [s].
     """
     try:
         trial = try_source(config, _FRAMES, timeout_s)

@@ -25,7 +25,6 @@ class CheckResult:
     """The result of a check, printed as one line.
 
     Attributes:
-        check: Name of the check.
         state: ``ok``; ``absent`` (missing, but only some users need it); ``warning`` (something will not work as it should);
             ``failure`` (the requested function cannot work).
         do: Action to take; empty if none is needed.
@@ -47,7 +46,6 @@ class DoctorCheck:
     """A check to run.
 
     Attributes:
-        name: Name of the check.
         run: Runs the check; may hang.
         deadline_s: Time after which the check counts as hung [s].
         cure: Action to take if it hangs.
@@ -99,8 +97,6 @@ def in_child(probe: str, *arguments: Any, timeout_s: float = CHILD_S) -> ProbeRe
     """Run a probe of `nodes.lab.doctor.probes` in a separate process, because a broken library may crash, hang, or use all memory.
 
     Args:
-        probe: Name of the probe.
-        arguments: Arguments of the probe, as plain data.
         timeout_s: Time after which the process is killed [s].
     """
     command = module_command("nodes.lab.doctor.probes", probe, json.dumps(arguments))

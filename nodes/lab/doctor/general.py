@@ -19,8 +19,6 @@ def checks(folder: Path, vicon_port: int, vesc_port: str | None = None) -> list[
     """Return all checks of a computer.
 
     Args:
-        folder: Folder for results.
-        vicon_port: UDP port of the motion-capture stream.
         vesc_port: Serial device of the VESC; None detects it.
     """
     vesc = partial(motor.vesc, vesc_port, required=vesc_port is not None)

@@ -59,12 +59,7 @@ class _Asked:
 
 
 def checks_of(plan: Plan, folder: Path) -> list[DoctorCheck]:
-    """Return the checks for a launch file on this host.
-
-    Args:
-        plan: The launch file for this host.
-        folder: Folder for its runs.
-    """
+    """Return the checks for a launch file on this host."""
     checks = [
         DoctorCheck("versions", machine.versions),
         DoctorCheck("machine", machine.machine),
@@ -235,7 +230,6 @@ def _try_policy(
     """Load a policy in a separate process.
 
     Args:
-        config: Configuration of the policy node.
         size: Width and height of the camera's images [px], if known.
 
     Returns:

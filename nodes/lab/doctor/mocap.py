@@ -41,7 +41,6 @@ def listen(
     Args:
         config: Configuration of the receiver. Without subjects, all are checked.
         required: Whether a missing stream is a failure.
-        listen_s: Time to listen [s].
         needed: Subjects whose absence is a failure; None means all configured subjects.
     """
     try:

@@ -20,9 +20,6 @@ class ImageFormat:
     """Format of the camera's images.
 
     Attributes:
-        width: Width [px].
-        height: Height [px].
-        rate_hz: Rate of images [Hz].
         compressed: Whether JPEG images are also published.
     """
 
@@ -41,10 +38,8 @@ def bytes_per_s(
     """Data rate of a bag [bytes/s].
 
     Args:
-        pictures: Format of the camera's images.
         topics: Recorded topics; None means the whole topic table.
         publishers: Roles of the running nodes; None means all.
-        statuses: Nodes whose status is recorded.
     """
     roles = None if publishers is None else set(publishers)
     total = statuses * STATUS_RATE_HZ * _SMALL_BYTES

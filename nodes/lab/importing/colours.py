@@ -27,7 +27,6 @@ class ColourMatch:
 
     Attributes:
         map: Map from learned colours to the driving camera's.
-        frames: Number of frames used for the fit.
         before_db: PSNR against the frames without the map [dB].
         after_db: PSNR against the frames with the map [dB].
     """
@@ -42,7 +41,6 @@ def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourM
     """Fit the map to frames of the driving camera and store it in the scene file.
 
     Args:
-        scene: Scene file.
         images: ``transforms.json`` of the driving camera, in the scene's world.
         output: Scene file to write, which may be the same.
         most: Largest number of frames, evenly spread.

@@ -58,10 +58,7 @@ def from_media(
     Args:
         media: Videos and folders of photographs.
         output: Folder of the data set. A stopped run resumes there.
-        media_config: Selection of frames.
-        sfm: Settings of structure from motion.
         extent_m: Assumed largest distance between two camera positions [m]; not used if ``metric`` gives the scale.
-        metric: Known facts about the world.
     """
 
     def build(folder: Path) -> Facts:
@@ -91,9 +88,6 @@ def from_bag(
     """Make a data set from recorded frames with motion-capture poses. No pose is estimated.
 
     Args:
-        bag: Bag folder or file.
-        output: Folder of the data set.
-        config: Selection of frames.
         margin_m: Margin of the scene box around the camera's trajectory [m].
         calibration: Camera calibration file; None uses the one in the bag.
     """
@@ -188,7 +182,6 @@ def write_model_set(
         output: Folder that the names of the images are relative to.
         poses: ``T_world_from_camera [N, 4, 4]`` of the images.
         points: Points of the scene ``[M, 3]``.
-        facts: Content of the report.
         pictures: Masks and splits of the images; empty for none.
         reached: Points ``[M, 3]`` around the content, for a scene without points.
     """

@@ -73,9 +73,7 @@ def take_frames(
     """Write frames of a bag as PNG files and determine their poses.
 
     Args:
-        bag: Bag folder or file.
         folder: Folder for the files, which are named by their capture stamps.
-        config: Selection of frames.
         calibration: Camera calibration file; None uses the one attached to the bag.
 
     Raises:

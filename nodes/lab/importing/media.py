@@ -43,7 +43,6 @@ def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Rep
 
     Args:
         media: Video files, folders of photographs, or single photographs. The single ones count as one folder.
-        output: Folder of the data set.
 
     Returns:
         One source for each video or folder, with paths relative to ``output``.

@@ -33,8 +33,6 @@ def from_scan(path: Path, output: Path, options: ScanOptions, metric: MetricOpti
     Args:
         path: Folder or file of the scan.
         output: Folder of the data set, with copies of the images.
-        options: Answers about the scan.
-        metric: Known facts about the world.
 
     Raises:
         AdvnerfError: The scan cannot be used.

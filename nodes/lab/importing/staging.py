@@ -39,9 +39,7 @@ def build_beside(
     resumes there. Other files in ``output`` are not touched. An earlier data set there is kept until the new one is complete.
 
     Args:
-        output: Folder of the data set.
         media: Input files, which must not be in the replaced folders.
-        build: Builds the data set in a given folder.
         resumes: Whether a failed or stopped import may keep its work folder. Otherwise it is always removed.
 
     Returns:

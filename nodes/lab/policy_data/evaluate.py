@@ -28,10 +28,6 @@ class Errors:
     """Statistics of predicted minus true steering.
 
     Attributes:
-        count: Number of compared frames.
-        mean_abs_rad: Mean absolute error [rad].
-        rms_rad: Root mean square error [rad].
-        worst_rad: Largest absolute error [rad].
         bias_rad: Mean error; positive means further left [rad].
         correlation: Pearson correlation; NaN if one side is constant.
         zero_rad: Mean absolute error of always steering straight, for comparison [rad].

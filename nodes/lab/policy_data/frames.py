@@ -49,10 +49,8 @@ def frames_of(log: DriveLog, view: PolicyView, expert: Expert | None, labels: La
     """Take the usable frames of a log.
 
     Args:
-        log: The log, in any format.
         view: View that converts its images to policy images.
         expert: The teacher, at the policy's delay; None is allowed for recorded labels.
-        labels: Source of the labels.
 
     Raises:
         LogError: The log lacks poses or controls for the labels, or has too few usable frames.

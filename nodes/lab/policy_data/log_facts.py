@@ -33,7 +33,6 @@ class LogFacts:
     Attributes:
         size: Width and height of the images [px].
         steering: Finite steering values in the log's unit.
-        missing: Number of steering values that are missing.
         same_image: Whether the first images are all the same.
         has_camera: Whether the calibration of the camera is attached.
     """

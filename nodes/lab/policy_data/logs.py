@@ -36,9 +36,6 @@ class OpenLog:
 
     Attributes:
         name: The path as written.
-        choice: Answers about it.
-        log: Description of the log.
-        labels: Source of its labels.
     """
 
     name: str
@@ -53,8 +50,6 @@ def open_logs(
     """Describe the logs that a user named.
 
     Args:
-        requests: The logs, each with its answers.
-        common: Answers about all logs.
         labels: Source of the labels; None leaves it to the format.
     """
     opened = []
@@ -69,7 +64,6 @@ def open_log(path: Path, choice: LogChoice | None = None) -> DriveLog:
     """Describe a recorded drive.
 
     Args:
-        path: File or folder.
         choice: Answers of the user; None leaves everything to the format.
 
     Raises:

@@ -34,8 +34,6 @@ class Training:
     """Result of a training.
 
     Attributes:
-        path: Policy file.
-        sha256: Hash of the policy file.
         validation_mae_rad: Mean absolute steering error on held-out frames [rad].
         frames: Number of frames of each recording, and of the surrogate.
         left_out: Number of skipped images of each recording, by reason.

@@ -19,12 +19,7 @@ _LEAST_POSES = 5
 
 
 def standing_poses(run_dir: Path, topic: str, period_s: float) -> Iterator[Array | None]:
-    """Yield the mean pose ``[4, 4]`` over a window once per period, for ever; None while the subject is lost.
-
-    Args:
-        run_dir: Folder of the running launch.
-        period_s: Time between two results [s].
-    """
+    """Yield the mean pose ``[4, 4]`` over a window once per period, for ever; None while the subject is lost."""
     recent: deque[tuple[float, Array]] = deque()
     with Bus(run_dir) as bus:
         bus.subscribe(topic, queue=1000)

@@ -30,12 +30,8 @@ def guide(
     """Show the displacement live until the target is in place, or until the timeout.
 
     Args:
-        run_dir: Folder of the running launch.
-        attack: The attack with its pose.
         target: Corners of the target that shows it.
         limits: Tolerated distance [m] and angle [rad].
-        once: Whether to measure only once.
-        timeout_s: Time limit [s].
 
     Returns:
         The last displacement and the subject's pose ``[4, 4]``; None if the subject was never seen.

@@ -78,9 +78,6 @@ def measure_drive(
     """Evaluate one drive as plain data: trajectory, cross-track errors, latency, shown attacks.
 
     Args:
-        span: Time span of the drive.
-        path: Reference path.
-        horizon: Ticks over which errors are summed.
         stopped: Why the car was stopped before the horizon's end; empty if it was not. Its last error is then held.
     """
     states = trajectory(bag, span.start_real_ns, horizon)

@@ -35,7 +35,6 @@ class PlannedDrive:
         condition: ``none``, or the name of a group of attack files.
         repeat: Index among the condition's runs, from 0.
         attack: Attack file; empty for none.
-        attack_id: Id of the attack.
     """
 
     number: int
@@ -83,12 +82,9 @@ class TrialsPlan:
     """The plan, which is fixed before the first run.
 
     Attributes:
-        launch: Launch file.
         overrides: ``node.key=value`` and ``params.name=value``.
-        seed: Random seed of the order.
         ticks: Control ticks of each drive, at 10 Hz.
         start_pose: Start pose of each drive: x [m], y [m], yaw [rad].
-        room_sha256: Hash of the room file.
         policy_sha256: Hash of the policy file; empty if the launch file names none.
         host: Host of the launch file that drives the trials; None if it has no hosts.
     """
@@ -109,8 +105,6 @@ def make_runs(attacks: dict[str, list[Path]], repeats: int, seed: int) -> tuple[
 
     Args:
         attacks: Attack files of each condition besides ``none``.
-        repeats: Number of runs of each condition.
-        seed: Random seed of the order.
     """
     ids = {str(file): load_attack(file).attack_id for files in attacks.values() for file in files}
     runs = []

@@ -77,8 +77,6 @@ def prepare_series(
         overrides: ``node.key=value`` and ``params.name=value``.
         folder: New folder, or the same series' folder.
         attacks: Attack files of each condition besides ``none``.
-        repeats: Number of runs of each condition.
-        seed: Random seed of the order.
         ticks: Control ticks of each drive, at 10 Hz.
         start_pose: Start pose of each drive; None uses the room's.
         host: Host of the launch file that this computer is, or all. It must be the operator's host, with the recorder.
@@ -119,8 +117,6 @@ def drive_series(
     """Drive the runs that are not finished.
 
     Args:
-        ready_timeout_s: Longest time for a graph to become ready [s].
-        begin: Called before each run.
         guide: Called with instructions for the operator.
     """
     done = series.results

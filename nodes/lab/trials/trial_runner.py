@@ -43,8 +43,6 @@ def run_trial(
         launch_file: The node graph, which records a bag.
         overrides: ``node.key=value`` and ``params.name=value``.
         run_dir: Folder of the run for ``trial.json``, the bag and the logs.
-        plan: The plan of the drive.
-        ready_timeout_s: Longest time for the graph to become ready [s].
         guide: Called with instructions for the operator of a real car.
         host: Host of the launch file that this computer is. The other host must be running.
 
@@ -66,7 +64,6 @@ class TrialNodes:
     Args:
         launch_file: The node graph, which records a bag.
         run_dir: Folder for sockets, logs and configurations of the nodes.
-        ready_timeout_s: Longest time for the graph to become ready [s].
 
     Attributes:
         starts: How often the whole graph was started.
@@ -95,7 +92,6 @@ class TrialNodes:
 
         Args:
             overrides: All overrides of the launch file for this trial.
-            plan: The plan of the drive.
             folder: Folder for ``trial.json`` and the bag.
             again: Nodes to start again even if their configuration stays.
 

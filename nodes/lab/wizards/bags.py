@@ -145,8 +145,6 @@ def still_views(bag: Path, detector: BoardDetector, board_topic: str | None) -> 
     """Find the frames with a board in view while car and board stood still.
 
     Args:
-        bag: Bag with frames and poses.
-        detector: Detector of the board.
         board_topic: Topic of the board's poses; None if it is not tracked.
 
     Returns:

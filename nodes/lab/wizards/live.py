@@ -15,9 +15,6 @@ def record_live(run_dir: Path, topics: Sequence[str], duration_s: float, bag: Pa
     """Record topics for a given time.
 
     Args:
-        run_dir: Folder of the running launch.
-        topics: Topics of the table.
-        duration_s: Duration [s].
         bag: New folder.
 
     Raises:

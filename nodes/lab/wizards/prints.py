@@ -113,9 +113,7 @@ def measure(
     Args:
         source: The photograph, or the bag.
         record: Sizes and markers of the print.
-        attack: The attack that was printed.
         camera: Lens or camera file; of a bag, and with a pose of the car, a camera file.
-        known: Known lengths of a photograph.
 
     Raises:
         CalibrationError: The source does not determine the print's pose.

@@ -38,7 +38,6 @@ def show_and_watch(
         frames: Endless stream of stamps [ns since 1970] and RGB images ``[H, W, 3]``.
         colours: Colours to show, 0..255.
         folder: New or empty folder.
-        now_ns: Returns the real time [ns].
 
     Raises:
         CalibrationError: The folder already has a session.

@@ -23,7 +23,6 @@ class WorldBench:
     """An open world under test.
 
     Attributes:
-        description: Description of the open world.
         step_s: A step's duration must be a multiple of this [s]; None for any duration.
     """
 

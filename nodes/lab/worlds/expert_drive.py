@@ -67,9 +67,7 @@ def drive_expert(
     """Drive from a start pose; the expert knows the true state, no picture is taken.
 
     Args:
-        expert: The expert, with its path.
         start: x [m], y [m], yaw [rad].
-        dt_s: Length of a tick [s].
     """
     scene.reset(*start)
     states, controls, blocked = [_now(scene)], [], None

@@ -48,7 +48,6 @@ class NamedWorld:
 
     Attributes:
         kind: Name of the world: built in, an entry point, or ``file.py:Class`` with the file's name alone.
-        world_class: The world's class.
         source_sha256: Hash of the code of a ``file.py:Class`` or an entry point; empty for a built-in name.
     """
 
