@@ -90,9 +90,7 @@ def paths_are_drivable(bench: WorldBench) -> str:
         if math.dist(path.pose_at(0.0)[:2], path.start_pose[:2]) > 1e-9:
             raise NotMet(f"path {name}: expected it to begin at its start pose; got {path.pose_at(0.0)}")
         curvature = float(np.abs(exact.curvature_at(np.linspace(0.0, exact.length_m, 400))).max())
-        needed = (
-            car.speed_mps * curvature if car.wheelbase_m is None else math.atan(car.wheelbase_m * curvature)
-        )
+        needed = _wanted_control(car, curvature)
         if needed > min(-car.control_limits[0], car.control_limits[1]):
             raise NotMet(
                 f"path {name}: expected curves that the car can follow; its tightest, of {1.0 / curvature:.2f} m, takes a control of {needed:.3f} "
@@ -186,20 +184,20 @@ def _steady(poses: Array, tick_s: float) -> tuple[float, float, float]:
     steps, turns = np.diff(poses[:, :2], axis=0), np.diff(np.unwrap(poses[:, 2]))
     way = np.linalg.norm(steps, axis=1)
     course = np.arctan2(steps[:, 1], steps[:, 0])
-    aside = np.abs(
-        wrap_angle(course - poses[:-1, 2] - 0.5 * turns)
-    )  # a chord points half-way through its turn
+    # A chord points half-way through its turn.
+    aside = np.abs(wrap_angle(course - poses[:-1, 2] - 0.5 * turns))
     return float(turns.mean()) / tick_s, float(way.mean()) / tick_s, float(aside.max())
 
 
 def _control(car: CarDescription, curvature_1pm: float) -> float:
-    """Control that turns the described car along a curvature."""
-    wanted = (
-        car.speed_mps * curvature_1pm
-        if car.wheelbase_m is None
-        else math.atan(car.wheelbase_m * curvature_1pm)
-    )
-    return float(np.clip(wanted, *car.control_limits))
+    """Control that turns the described car along a curvature, within its limits."""
+    return float(np.clip(_wanted_control(car, curvature_1pm), *car.control_limits))
+
+
+def _wanted_control(car: CarDescription, curvature_1pm: float) -> float:
+    if car.wheelbase_m is None:
+        return car.speed_mps * curvature_1pm
+    return math.atan(car.wheelbase_m * curvature_1pm)
 
 
 def _largest_curvature(car: CarDescription) -> float:

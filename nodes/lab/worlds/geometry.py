@@ -131,13 +131,7 @@ def box_holds_what_is_seen(bench: WorldBench) -> str:
     """The box holds everything that the driving camera sees, or at least the driven paths if the rest is contracted."""
     box = bench.description.box
     if box.contraction:
-        points = np.array(
-            [
-                [*path.pose_at(float(s))[:2], 0.0]
-                for path in bench.description.paths.values()
-                for s in np.linspace(0.0, bench.driven_m(path), 50)
-            ]
-        )
+        points = _on_the_paths(bench, 50)
         what = "the paths"
     else:
         points = np.concatenate([_points(bench, place)[0] for place in bench.places])
@@ -169,14 +163,7 @@ def photographs_cover(bench: WorldBench) -> str:
             f"expected cameras above the ground with y pointing down; got {int((~high).sum())} of {count} below the ground and {int((~upright).sum())} upside "
             "down: OpenGL cameras, which look along -z with y up, must be turned: T @ diag(1, -1, -1, 1)"
         )
-    points = np.array(
-        [
-            [*path.pose_at(float(s))[:2], 0.0]
-            for path in bench.description.paths.values()
-            for s in np.linspace(0.0, bench.driven_m(path), 40)
-        ]
-    )
-    lens = world.photo_pinhole
+    points, lens = _on_the_paths(bench, 40), world.photo_pinhole
     seen = np.zeros(len(points), dtype=int)
     for T in poses:
         there = transform_points(invert_transform(T), points)
@@ -190,6 +177,17 @@ def photographs_cover(bench: WorldBench) -> str:
             "take photographs along all paths, looking where the car looks"
         )
     return f"{100 * share:.0f} % of the paths are looked at by {_SEEN_BY} of {count} photographs or more"
+
+
+def _on_the_paths(bench: WorldBench, count: int) -> Array:
+    """Points on the ground along the driven stretch of each path ``[P * count, 3]`` [m]."""
+    return np.array(
+        [
+            [*path.pose_at(float(s))[:2], 0.0]
+            for path in bench.description.paths.values()
+            for s in np.linspace(0.0, bench.driven_m(path), count)
+        ]
+    )
 
 
 def _pairs_of_views(bench: WorldBench) -> list[list[tuple[CameraView, CameraView]]]:
@@ -268,10 +266,8 @@ def _agreement(reading: Reading, pairs: list[list[tuple[CameraView, CameraView]]
 def _in_one_place(reading: Reading, one: CameraView, other: CameraView, pinhole: Pinhole) -> tuple[int, int]:
     """Number of points of a view's lower part whose depth and colour agree with the other view, and number of points within the other view."""
     directions = pinhole.directions()
-    below = (
-        slice(pinhole.height // 2, None, _EVERY_PX),
-        slice(None, None, _EVERY_PX),
-    )  # the ground and objects on it
+    # The ground and objects on it.
+    below = slice(pinhole.height // 2, None, _EVERY_PX), slice(None, None, _EVERY_PX)
     z_m = np.asarray(reading.seen(reading.planar(one.depth, directions)), dtype=np.float64)[below]
     known = np.isfinite(z_m) & (z_m > 0.0)
     colour = reading.seen(one.rgb)[below][known]

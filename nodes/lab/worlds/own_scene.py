@@ -122,9 +122,6 @@ class OwnScene(Undriven):
         learned = load_box(Path(str(self.config.file)))
         return Box(learned.box_low_m, learned.box_high_m, learned.contraction)
 
-    def __enter__(self) -> OwnScene:
-        return self
-
 
 def _reference(path: DrivingPath, start: Pose, goal: tuple[float, ...]) -> ReferencePath:
     """A calibrated path in the form that worlds use."""

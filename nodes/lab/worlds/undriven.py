@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, NoReturn
+from typing import ClassVar, NoReturn, TypeVar
 
 from hardware.worlds.world import WorldError
+
+T = TypeVar("T")
 
 
 class Undriven:
@@ -20,6 +22,9 @@ class Undriven:
 
     state = blocked = property(_refuse)
     reset = step = observe = observe_at = photograph = _refuse
+
+    def __enter__(self: T) -> T:
+        return self
 
     def __exit__(self, *raised: object) -> None:
         return

@@ -186,9 +186,6 @@ class Photographs(Undriven):
         """Poses of the photographs, for any ``count``."""
         return [self._T_world_from_images @ each.T_world_from_camera for each in self._all]
 
-    def __enter__(self) -> Photographs:
-        return self
-
 
 def _require_upright(R_world_from_camera: Array) -> None:
     """Raise unless cameras ``[N, 3, 3]`` look ahead with the horizon level, as the mount of a driving camera is taken to.
