@@ -55,7 +55,10 @@ def doctor(
     Exit code 0: no failure found. 1: something will not work. 2: the launch file or an option is wrong.
     """
     if gpu:
-        _compare_gpu(gpu_device)
+        from nodes.lab.doctor.gpu import compare_gpu
+
+        if not compare_gpu(gpu_device, typer.echo):
+            raise typer.Exit(_FAILURE_EXIT)
         return
     from nodes.lab.doctor.check import FAILURE, examine, worst
 
@@ -71,16 +74,6 @@ def doctor(
         counts = {word: sum(finding.state == word for finding in findings) for word in ("failure", "warning")}
         print(", ".join(f"{count} {word}{'s' * (count != 1)}" for word, count in counts.items()))
     if state == FAILURE:
-        raise typer.Exit(_FAILURE_EXIT)
-
-
-def _compare_gpu(device: str) -> None:
-    from nodes.lab.doctor.gpu import GpuReport
-
-    report = GpuReport(device)
-    for line in report:
-        typer.echo(line)
-    if not report.works:
         raise typer.Exit(_FAILURE_EXIT)
 
 

@@ -6,7 +6,7 @@ import importlib.metadata
 import platform
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from nodes.lab.doctor import graphics
@@ -17,36 +17,31 @@ _LIMIT_S = 300.0  # the processor's kernels may have to be compiled first
 _SMI_S = 10.0
 
 
-class GpuReport:
-    """A report, made line by line by iterating over it.
+def compare_gpu(device: str, say: Callable[[str], None]) -> bool:
+    """Say the lines of the report as they come. Returns whether searches can use the device.
 
     Args:
         device: ``cuda``, or ``cpu``, which runs the same code without a GPU.
-
-    Attributes:
-        works: Whether searches can use the device; known at the end.
     """
-
-    def __init__(self, device: str = "cuda") -> None:
-        self._device = device
-        self.works = False
-
-    def __iter__(self) -> Iterator[str]:
-        torch = in_child("torch")
-        if self._device != "cpu" and not (torch.data and torch.data["gpus"]):
-            (found,) = graphics.torch_found(torch)
-            yield f"no GPU to compare: torch {found.found}" + (f" -> {found.do}" if found.do else "")
-            return
-        yield "```"
-        yield f"advnerf {_version('advnerf')}, Python {platform.python_version()}, Linux {platform.release()}, {processor_name()}"
-        build = f"{torch.data['version']}, CUDA {torch.data['built_for']}" if torch.data else torch.trouble
-        yield f"torch {build}, numba {_version('numba')}"
-        yield f"driver {_driver()}; GPUs: {', '.join(torch.data['gpus'] if torch.data else []) or 'none'}"
-        compared = in_child("gpu", self._device, timeout_s=_LIMIT_S)
-        yield from _table(compared)
-        self.works = _agrees(compared)
-        yield f"searches with --device cuda use {'the GPU' if self.works else 'the processor'}"
-        yield "```"
+    torch = in_child("torch")
+    if device != "cpu" and not (torch.data and torch.data["gpus"]):
+        (found,) = graphics.torch_found(torch)
+        say(f"no GPU to compare: torch {found.found}" + (f" -> {found.do}" if found.do else ""))
+        return False
+    say("```")
+    say(
+        f"advnerf {_version('advnerf')}, Python {platform.python_version()}, Linux {platform.release()}, {processor_name()}"
+    )
+    build = f"{torch.data['version']}, CUDA {torch.data['built_for']}" if torch.data else torch.trouble
+    say(f"torch {build}, numba {_version('numba')}")
+    say(f"driver {_driver()}; GPUs: {', '.join(torch.data['gpus'] if torch.data else []) or 'none'}")
+    compared = in_child("gpu", device, timeout_s=_LIMIT_S)
+    for line in _table(compared):
+        say(line)
+    works = _agrees(compared)
+    say(f"searches with --device cuda use {'the GPU' if works else 'the processor'}")
+    say("```")
+    return works
 
 
 def _version(package: str) -> str:

@@ -29,7 +29,6 @@ from nodes.motor import MotorConfig
 from nodes.policy import PolicyNodeConfig
 from nodes.recorder import RecorderConfig
 from nodes.ros2 import Ros2Config
-from nodes.runtime.errors import ConfigError
 from nodes.safety import SafetyConfig
 from nodes.vicon import ViconNodeConfig
 from nodes.viewer import ViewerConfig
@@ -200,13 +199,10 @@ def _image_size(plan: Plan) -> tuple[int, int] | None:
     """Width and height of the launch's camera [px], from the first calibration that a node names."""
     for entry in plan.documents.values():
         for key in ("calibration", "camera"):
-            if (found := _camera_file(entry.data.get(key))) is not None:
+            file = entry.data.get(key)
+            if isinstance(file, str) and file.endswith(".yaml") and (found := _calibration(Path(file))):
                 return found.width, found.height
     return None
-
-
-def _camera_file(value: Any) -> CameraCalibration | None:
-    return _calibration(Path(value)) if isinstance(value, str) and value.endswith(".yaml") else None
 
 
 def _policy_findings(config: PolicyNodeConfig, size: tuple[int, int] | None) -> list[CheckResult]:
@@ -300,7 +296,7 @@ def pictures_of(plan: Plan) -> ImageFormat:
             try:
                 config = validate(CameraNodeConfig, plan.documents[name])
                 size = load_calibration(CameraCalibration, config.calibration)
-            except (ConfigError, AdvnerfError):
+            except AdvnerfError:
                 break
             rate_hz = 1.0 / config.source.period_s() if config.source.period_s() else ImageFormat.rate_hz
             return ImageFormat(size.width, size.height, rate_hz, config.compressed is not None)
