@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.video import thinned
 from advnerf_core.data.views import ImageSet
 from advnerf_core.scene.colour import IDENTITY, ColourMap, fit_colour_map
 from advnerf_core.scene.field import load_scene, save_scene
@@ -49,10 +50,7 @@ def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourM
         ImportRecordingError: The frames do not show the scene.
     """
     listed = load_transforms(images)
-    chosen = np.unique(
-        np.linspace(0, len(listed.frames) - 1, min(most, len(listed.frames))).round().astype(int)
-    )
-    frames = listed.with_frames([listed.frames[i] for i in chosen]).load()
+    frames = listed.with_frames(thinned(list(listed.frames), most)).load()
     field, occupied, metadata = load_scene(scene)
     # Do not apply the map of an earlier fit.
     learned = seen_colours(FieldRenderer.from_file(scene, IDENTITY), frames)

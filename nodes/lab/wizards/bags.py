@@ -39,8 +39,6 @@ _HALF_WINDOW_S = 0.15
 _MOST_MOTION_M = 0.004
 # Largest angle of a pose from their mean [rad].
 _MOST_TURN_RAD = 0.008
-# Number of frames taken per stop.
-_PER_STOP = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +140,7 @@ def read_drive(bag: Path) -> RecordedDrive:
 
 
 def still_views(bag: Path, detector: BoardDetector, board_topic: str | None) -> tuple[list[MountView], int]:
-    """Find the frames with a board in view while car and board stood still.
+    """Find the middle frame with a board in view of each time that car and board stood still.
 
     Args:
         board_topic: Topic of the board's poses; None if it is not tracked.
@@ -161,12 +159,7 @@ def still_views(bag: Path, detector: BoardDetector, board_topic: str | None) -> 
             stops[-1].append(view)
         elif stops[-1]:
             stops.append([])
-    chosen = []
-    for stop in stops:
-        if stop:
-            middles = np.linspace(0, len(stop) - 1, min(_PER_STOP, len(stop)) + 2)[1:-1]
-            chosen += [stop[round(i)] for i in middles]
-    return chosen, count
+    return [stop[round(0.5 * (len(stop) - 1))] for stop in stops if stop], count
 
 
 def read_shown(folder: Path) -> tuple[Array, Array, Array]:

@@ -13,6 +13,7 @@ from advnerf_core.attack.artifact import AttackFile
 from advnerf_core.attack.printing.poster import Printable, PrintError, poster_of
 from advnerf_core.attack.printing.record import PrintRecord
 from advnerf_core.data.image_files import write_image
+from advnerf_core.data.video import thinned
 from advnerf_core.files import write_json
 from advnerf_core.geometry import Array, invert_transform, planar_pose, transform_points
 from advnerf_core.plain import PlainData
@@ -207,8 +208,7 @@ def _measure_drive(
         raise DegenerateDataError(
             f"{bag}: expected pictures of the print from known poses of {CAR}, got none; drive nearer, or print larger markers"
         )
-    chosen = np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).round().astype(int))
-    placed = place_print([views[k] for k in chosen], record.markers, camera.pinhole)
+    placed = place_print(thinned(views, _MOST_VIEWS), record.markers, camera.pinhole)
     poses_before = [invert_transform(each.T_world_from_camera) @ placed.T_world_from_face for each in views]
     for T in poses_before:
         T[:3, 3] /= placed.scale  # in nominal units
