@@ -182,20 +182,21 @@ def scene_field(
     aabb_scale = listed.aabb_scale or 1.0
     transparent = images is not None and _transparent(images)
     low, high, unbounded = _box(request, listed, images if transparent else None)
-    common = {"contraction": unbounded, "learned_background": not transparent}
     if request.preset == "instant-ngp":
         # Müller et al. 2022, table 1 and section 5.4, and the sizes of its configs/nerf/base.json.
-        grid = HashGridConfig(
-            levels=16, features=2, log2_entries=19, coarsest=16, finest=round(2048 * aabb_scale)
-        )
-        return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=4, **common)
-    if request.preset in SCENE_PRESETS:
-        grid = SCENE_PRESETS[request.preset].grid_for(unbounded)
-        return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=PHOTOGRAPH_BANDS, **common)
-    # The contracted cube is twice as wide as its inner region, so twice the cells keep the detail.
-    grid = HashGridConfig(levels=8, features=4, finest=4096 if unbounded else 2048)
-    bands = 3 if request.open_scene or unbounded else 1
-    return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=bands, **common)
+        finest = round(2048 * aabb_scale)
+        grid = HashGridConfig(levels=16, features=2, log2_entries=19, coarsest=16, finest=finest)
+        bands = 4
+    elif request.preset in SCENE_PRESETS:
+        grid, bands = SCENE_PRESETS[request.preset].grid_for(unbounded), PHOTOGRAPH_BANDS
+    else:
+        # The contracted cube is twice as wide as its inner region, so twice the cells keep the detail.
+        grid = HashGridConfig(levels=8, features=4, finest=4096 if unbounded else 2048)
+        bands = 3 if request.open_scene or unbounded else 1
+    box = _corner(low), _corner(high)
+    return SceneFieldConfig(
+        *box, grid, direction_bands=bands, contraction=unbounded, learned_background=not transparent
+    )
 
 
 def _box(
@@ -240,23 +241,20 @@ def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: Marc
     is_open = request.open_scene or field.contraction
     steps, minutes = request.length
     if request.preset in SCENE_PRESETS:
-        return replace(
-            SCENE_PRESETS[request.preset].train_config(minutes, steps),
-            seed=request.seed,
-            checkpoint_every_s=request.checkpoint_every_s,
-            march=march,
-            opacity=0.0 if is_open else TrainConfig.opacity,
-            exposure=request.exposure,
+        config = SCENE_PRESETS[request.preset].train_config(minutes, steps)
+    else:
+        config = replace(
+            FAST,
+            steps=steps or _NO_TIME_LIMIT_STEPS,
+            max_seconds=None if minutes is None else 60.0 * minutes,
+            distortion=2e-3 if is_open else TrainConfig.distortion,
         )
     return replace(
-        FAST,
-        steps=steps or _NO_TIME_LIMIT_STEPS,
+        config,
         seed=request.seed,
         checkpoint_every_s=request.checkpoint_every_s,
-        max_seconds=None if minutes is None else 60.0 * minutes,
         march=march,
         opacity=0.0 if is_open else TrainConfig.opacity,
-        distortion=2e-3 if is_open else TrainConfig.distortion,
         exposure=request.exposure,
     )
 
