@@ -105,14 +105,6 @@ class FirstPicture:
         self._process.terminate()
         wait_or_kill(self._process, _END_S)
 
-    def wait(self, timeout_s: float) -> int | None:
-        """Wait for the end of the drive; its exit code, or None without a drive.
-
-        Raises:
-            subprocess.TimeoutExpired: It has not ended.
-        """
-        return None if self._process is None else self._process.wait(timeout_s)
-
     def _pass_on(self, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
         for line in process.stdout:

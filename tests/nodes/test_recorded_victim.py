@@ -35,7 +35,7 @@ def test_an_installation_without_one_says_so_in_a_line(tmp_path, monkeypatch):
     assert find_recorded(tmp_path) is None
     monkeypatch.setattr("nodes.lab.recorded_victim.find_recorded", lambda: None)
     with FirstPicture(tmp_path, said.append) as drive:
-        assert drive.wait(0.0) is None
+        assert drive._process is None
     assert said == [MISSING]
     assert recorded_state(tmp_path) is None
 
@@ -62,7 +62,7 @@ def test_a_drive_that_does_not_count_live_is_driven_in_the_lab_and_labelled(tmp_
     # A second start of the experiment drives nothing again.
     again = []
     with FirstPicture(tmp_path, again.append) as drive:
-        assert drive.wait(0.0) is None
+        assert drive._process is None
     assert again == [f"{LABEL} Film of an earlier start: {film}"]
 
 
@@ -71,7 +71,7 @@ def test_a_drive_that_does_not_count_live_is_driven_in_the_lab_and_labelled(tmp_
 def test_the_first_picture_and_the_film_come_beside_an_experiment(tmp_path):
     said = []
     with FirstPicture(tmp_path, said.append) as drive:
-        assert drive.wait(600.0) == 0
+        assert drive._process.wait(600.0) == 0
     (film,) = (tmp_path / FOLDER).glob("clip.*")
     assert film.stat().st_size > 10_000
     assert (tmp_path / FOLDER / NOW).stat().st_size > 1000
