@@ -6,6 +6,7 @@ be restarted. So every repeat of a request carries the same id, and the node put
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -53,33 +54,23 @@ def ask(
     bus.subscribe(answers)
     asked = RequestIdentity.at(clock.now())
     began = time.monotonic()
-    next_s, taken = began, None
+    next_s = began
+    taken: BusError | None = None
     while True:
         now_s = time.monotonic()
         if now_s >= next_s:
-            next_s = now_s + every_s
-            taken = _publish(bus, topic, make(asked, clock.now()))
+            next_s, taken = now_s + every_s, None
+            try:
+                bus.publish(topic, make(asked, clock.now()))
+            except BusError as error:
+                taken = error  # all endpoints of the topic are in use; one may become free
         bus.wait(max(0.0, next_s - time.monotonic()))
         for received in bus.receive():
-            answer = _read(read, asked.ask_id, received)
-            if answer is not None:
-                return answer
+            # Invalid bytes must not end a request to stop the car.
+            with contextlib.suppress(MessageError):
+                if (answer := read(asked.ask_id, received)) is not None:
+                    return answer
         if time.monotonic() - began > patience_s:
             raise taken or NoAnswerError(
                 f"expected an answer on {answers} to the request on {topic} within {patience_s:g} s, got none"
             )
-
-
-def _publish(bus: Bus, topic: str, message: Any) -> BusError | None:
-    try:
-        bus.publish(topic, message)
-    except BusError as error:
-        return error  # all endpoints of the topic are in use; one may become free
-    return None
-
-
-def _read(read: Callable[[str, Received], T | None], ask_id: str, received: Received) -> T | None:
-    try:
-        return read(ask_id, received)
-    except MessageError:
-        return None  # invalid bytes must not end a request to stop the car

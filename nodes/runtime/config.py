@@ -25,19 +25,16 @@ def apply_overrides(document: Document, overrides: Iterable[str], prefix: Key = 
         # An empty file has no keys. An empty value, or null, is None.
         parsed = parse_yaml(value, f"--set {text}").data if value.strip() not in _NONE else None
         target = document.data
-        for step in key[:-1]:
+        for number, step in enumerate(key, start=1):
             if not isinstance(target, dict):
                 raise ConfigError(
                     f"--set {text}: expected a section above {step!r}, got a value without keys; correct the key"
                 )
-            if target.get(step) is None:
+            if number == len(key):
+                target[step] = parsed
+            elif target.get(step) is None:
                 target[step] = {}
             target = target[step]
-        if not isinstance(target, dict):
-            raise ConfigError(
-                f"--set {text}: expected a section above {key[-1]!r}, got a value without keys; correct the key"
-            )
-        target[key[-1]] = parsed
         document.places[key] = f"--set {text}"
 
 
