@@ -283,9 +283,8 @@ class SafetyNode(Node):
         ask_id, source, stamp_ns = str(message.ask_id), str(message.source), stamp_of(message)
         asked_ns = min(asked_mono_ns(message, info), captured_mono_ns(stamp_ns, now), now.mono_ns)
         if message.arm:
-            age_s = min(
-                0.0, stamp_age_s(stamp_ns, now.real_ns)
-            )  # the age itself is judged with the other conditions
+            # The age itself is judged with the other conditions.
+            age_s = min(0.0, stamp_age_s(stamp_ns, now.real_ns))
             problem = stamp_problem(age_s, 0.0, self._arming.clocks.ahead_s(now.mono_ns))
             refusal = f"the request does not count: {problem}" if problem else ""
             self._requests.arm(ask_id, source, asked_ns, now.mono_ns, refusal)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -167,8 +168,6 @@ class TeleopNode(Node):
 def _layout(path: Path, axes: tuple[int, int] | None) -> GamepadLayout | None:
     if axes is None:
         return None
-    from dataclasses import replace
-
     usual = JS_LAYOUT if path.name.startswith("js") else EVENT_LAYOUT
     return replace(usual, throttle=axes[0], steering=axes[1])
 

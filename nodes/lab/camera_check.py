@@ -161,9 +161,8 @@ def opens_twice(bench: CameraBench) -> str:
     if stamps != sorted(set(stamps)):
         raise NotMet(f"expected stamps that rise over every open(), got {stamps} ns")
     deadline = time.monotonic() + _LATE_S
-    while (
-        left := _open_files() - files
-    ) > 0:  # a server may take a moment to notice that its client has left
+    # A server may take a moment to notice that its client has left.
+    while (left := _open_files() - files) > 0:
         if time.monotonic() > deadline:
             raise NotMet(f"expected close() to close every file and socket, got {left} left open")
         time.sleep(0.01)

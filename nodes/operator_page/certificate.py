@@ -39,23 +39,23 @@ def page_folder() -> Path:
 def certificate(folder: Path | None = None) -> Certificate:
     """Return the certificate of this user. It is made at the first use, and again a month before it expires."""
     folder = page_folder() if folder is None else folder
-    found = Certificate(folder / "certificate.pem", folder / "key.pem", "")
-    if not _is_valid(found):
-        _make(found)
-    return Certificate(found.file, found.key_file, _fingerprint(found.file.read_bytes()))
+    file, key_file = folder / "certificate.pem", folder / "key.pem"
+    if not _is_valid(file, key_file):
+        _make(file, key_file)
+    return Certificate(file, key_file, _fingerprint(file.read_bytes()))
 
 
-def _is_valid(found: Certificate) -> bool:
+def _is_valid(file: Path, key_file: Path) -> bool:
     from cryptography import x509
 
-    if not (found.file.exists() and found.key_file.exists()):
+    if not (file.exists() and key_file.exists()):
         return False
     now = datetime.datetime.now(datetime.timezone.utc)
-    known = x509.load_pem_x509_certificate(found.file.read_bytes())
+    known = x509.load_pem_x509_certificate(file.read_bytes())
     return known.not_valid_after_utc - now > datetime.timedelta(days=_RENEW_DAYS)
 
 
-def _make(target: Certificate) -> None:
+def _make(file: Path, key_file: Path) -> None:
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -81,15 +81,15 @@ def _make(target: Certificate) -> None:
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), True)
     )
     signed = builder.sign(key, hashes.SHA256())
-    target.file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    target.file.parent.chmod(0o700)
+    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    file.parent.chmod(0o700)
     pem = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    descriptor = os.open(target.key_file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    descriptor = os.open(key_file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with os.fdopen(descriptor, "wb") as stream:
         stream.write(pem)
-    write_atomically(target.file, signed.public_bytes(serialization.Encoding.PEM))
+    write_atomically(file, signed.public_bytes(serialization.Encoding.PEM))
 
 
 def _fingerprint(pem: bytes) -> str:

@@ -302,10 +302,8 @@ class PageServer:
             sending.cancel()
             del self._clients[client.number]
             self.inbox.put(Gone(client.number))
-            with contextlib.suppress(
-                asyncio.CancelledError, Exception
-            ):  # a send that failed with its connection
-                await sending
+            with contextlib.suppress(asyncio.CancelledError, Exception):
+                await sending  # it may have failed with its connection
 
     async def _listen(self, websocket: Any, client: Client) -> None:
         while True:

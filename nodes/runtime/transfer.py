@@ -99,10 +99,8 @@ class Assembler:
         key = (instance_id, str(chunk.name), str(chunk.sha256), int(chunk.size_bytes), int(chunk.count))
         index, trouble = int(chunk.index), ""
         if self._key is None and index > 0:
-            return (
-                None,
-                "",
-            )  # the rest of a transfer that was aborted or began before the subscription; the file is sent again
+            # The rest of a transfer that was aborted or began before the subscription; the file is sent again.
+            return None, ""
         if self._key is not None and (key != self._key or index != len(self._parts)):
             came = f"piece {index + 1} of {key[4]} of {key[1]}"
             trouble = f"expected piece {len(self._parts) + 1} of {self._key[4]} of {self._key[1]}, got {came}; waiting for the next transfer"
@@ -122,10 +120,8 @@ class Assembler:
         data = bytes(chunk.data)
         if len(data) != expected:
             self._forget()
-            return (
-                None,
-                f"expected {expected} bytes in piece {int(chunk.index) + 1} of {name}, got {len(data)}",
-            )
+            piece = int(chunk.index) + 1
+            return None, f"expected {expected} bytes in piece {piece} of {name}, got {len(data)}"
         self._parts.append(data)
         if len(self._parts) < count:
             return None, trouble

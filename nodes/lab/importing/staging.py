@@ -113,9 +113,8 @@ def _take_over(output: Path, work: Path) -> None:
         return
     shutil.copytree(output / IMAGES, work / IMAGES, copy_function=_link_or_copy)
     if (output / COLMAP).exists():
-        shutil.copytree(
-            output / COLMAP, work / COLMAP
-        )  # copied instead of linked, because COLMAP writes to its database
+        # Copied instead of linked, because COLMAP writes to its database.
+        shutil.copytree(output / COLMAP, work / COLMAP)
 
 
 def _link_or_copy(source: str, target: str) -> None:
