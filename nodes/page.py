@@ -26,7 +26,7 @@ from nodes.operator_page.config import PageConfig
 from nodes.operator_page.desk import Desk
 from nodes.operator_page.diary import Diary
 from nodes.operator_page.disk import DiskWriter
-from nodes.operator_page.operation import ACT, FILE, RESET, SWITCH, TELEOP, Operation, Parts
+from nodes.operator_page.operation import ACT, FILE, RESET, SWITCH, TELEOP, Operation
 from nodes.operator_page.pictures import ATTACKED, CAMERA, POLICY, Picture, jpeg_of, view_of_policy
 from nodes.operator_page.recording import LAUNCH_RECORDER, RECORDER, RecorderControl
 from nodes.operator_page.server import PageServer
@@ -70,7 +70,7 @@ class PageNode(Node):
         self._recording = RecorderControl(run_dir, nodes)
         path = None if room is None else room.reference_path
         off_track_m = _OFF_TRACK_M if room is None else room.off_track_m
-        parts = Parts(
+        self._operation = Operation(
             self._desk,
             self._board,
             self._diary,
@@ -80,9 +80,9 @@ class PageNode(Node):
             launched,
             None if room is None else room.start_pose,
             self._operates,
+            lambda client, answer: self._server.answer(client, answer),
         )
         self.inbox: Inbox[ClientAct | Gone] = Inbox(_INBOX)
-        self._operation = Operation(parts, lambda client, answer: self._server.answer(client, answer))
         recorders = [name for name in (RECORDER, LAUNCH_RECORDER) if self._operates and name not in nodes]
         statuses = tuple(map(status_topic, (*nodes, *recorders)))
         self.subscriptions = (config.camera_topic, _COMPOSITOR, *topics.TOPICS, *statuses)

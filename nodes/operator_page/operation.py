@@ -41,8 +41,8 @@ _RECORDING = "this page shows a recording, which has no car to stop"
 
 
 @dataclass
-class Parts:
-    """Collaborators of an operation.
+class Operation:
+    """Decides acts.
 
     Attributes:
         desk: Lease, button and e-stop.
@@ -50,6 +50,7 @@ class Parts:
         catalogue: Attacks by id.
         start_pose: Start of a trial: x [m], y [m], yaw [rad]; None without a room.
         operates: Whether the page may do more than show and stop the car.
+        answer: Sends the answer to an act to a browser, by the number of its connection.
     """
 
     desk: Desk
@@ -61,17 +62,9 @@ class Parts:
     launched: Launched
     start_pose: tuple[float, float, float] | None
     operates: bool
+    answer: Callable[[int, dict[str, Any]], None]
 
-
-class Operation:
-    """Decides acts.
-
-    Args:
-        answer: Sends the answer to an act to a browser, by the number of its connection.
-    """
-
-    def __init__(self, parts: Parts, answer: Callable[[int, dict[str, Any]], None]) -> None:
-        self._parts, self._answer = parts, answer
+    def __post_init__(self) -> None:
         self._asker = ArmAsker()
         self._told: tuple[str, bool] | None = None
         self._told_ns = self._switched_ns = 0
@@ -89,36 +82,36 @@ class Operation:
         """Decide an act, log it, and answer it."""
         act = asked.act
         if isinstance(act, Stop):
-            refusal = "" if self._parts.operates or self._parts.launched.known else _RECORDING
+            refusal = "" if self.operates or self.launched.known else _RECORDING
             outs = [] if refusal else self._stop(asked, act, now)
             return [*outs, *self._note(asked, act.t, "", refusal, now)]
         if isinstance(act, Hold):
             return self._hold(asked, act, now)
         name, detail = act.t, ""
         outs = []
-        if not self._parts.operates:
+        if not self.operates:
             refusal = _ONLY_WATCHES
-        elif not isinstance(act, Take) and (found := self._parts.desk.refusal(asked.client)):
+        elif not isinstance(act, Take) and (found := self.desk.refusal(asked.client)):
             refusal = found
         else:
-            self._parts.desk.acted(asked.client, now.mono_ns)
+            self.desk.acted(asked.client, now.mono_ns)
             refusal, detail, outs = self._do(asked, now)
         return [*outs, *self._note(asked, name, detail, refusal, now)]
 
     def gone(self, client: int, now: Now) -> list[Out]:
         """Note that a browser has gone. If it held the button, the car stops at once."""
-        lease = self._parts.desk.lease
-        if not self._parts.desk.leave(client) or lease is None:
+        lease = self.desk.lease
+        if not self.desk.leave(client) or lease is None:
             return []
         return self._ended("the page was closed or lost its connection", lease.name, now)
 
     def heard_safety(self, message: Any, info: MessageInfo) -> None:
         """Note a state of the safety node. A page that starts takes over the e-stop that is latched there."""
         self._asker.heard(message, info)
-        if self._parts.operates and not self._knows_latch:
+        if self.operates and not self._knows_latch:
             self._knows_latch = True
             if message.reason == ESTOP_LATCHED:
-                self._parts.desk.stop()
+                self.desk.stop()
 
     def heard_motor(self, message: Any, info: MessageInfo) -> None:
         """Note a report of the motor node."""
@@ -130,32 +123,31 @@ class Operation:
 
     def tick(self, now: Now) -> list[Out]:
         """Check the button, and repeat what has to be repeated."""
-        if not self._parts.operates:
+        if not self.operates:
             return self._asker.tick(now)
-        parts, outs = self._parts, []
-        lease = parts.desk.lease
-        if ended := parts.desk.check(now.mono_ns):
+        outs: list[Out] = []
+        lease = self.desk.lease
+        if ended := self.desk.check(now.mono_ns):
             outs += self._ended(ended, lease.name if lease else "", now)
-        board = parts.board
+        board = self.board
         reason = self._why_ended or board.stop_reason
-        if parts.trial.step(board.armed, board.position_m, board.drawn_attack, now.mono_ns, reason):
+        if self.trial.step(board.armed, board.position_m, board.drawn_attack, now.mono_ns, reason):
             outs += self._end_trial("the trial is over", now)
         if self._rearm_ns is not None and now.mono_ns >= self._rearm_ns:
             self._rearm_ns = None
             self._asker.arm(now, "e-stop reset on the page")
-        parts.recording.check()
+        self.recording.check()
         outs += self._arming(now)
         return [*outs, *self._teleop(now), *self._asker.tick(now), *self._attack(now)]
 
     def state(self, now: Now) -> dict[str, Any]:
         """Describe the desk and what was asked, for the page."""
-        parts = self._parts
         return {
             "lease": self._lease(now),
-            "held": parts.desk.held,
-            "press": parts.desk.press,
+            "held": self.desk.held,
+            "press": self.desk.press,
             "ended": self._why_ended,
-            "estop": parts.desk.estop,
+            "estop": self.desk.estop,
             "unanswered_s": round(self._asker.unanswered_s(now), 1),
             "not_confirmed": self._asker.not_confirmed(now),
             "stops": list(self.stops()),
@@ -164,24 +156,24 @@ class Operation:
                 "show": self._show is not False,
                 "trouble": self._transfer_trouble(now),
             },
-            "trial": parts.trial.state(),
-            "recording": parts.recording.state(),
-            "acts": parts.diary.last,
+            "trial": self.trial.state(),
+            "recording": self.recording.state(),
+            "acts": self.diary.last,
         }
 
     def _lease(self, now: Now) -> dict[str, Any] | None:
-        lease = self._parts.desk.lease
+        lease = self.desk.lease
         if lease is None:
             return None
-        left_s = round(self._parts.desk.left_s(now.mono_ns))
+        left_s = round(self.desk.left_s(now.mono_ns))
         return {"client": lease.client, "session": lease.session, "name": lease.name, "left_s": left_s}
 
     def _hold(self, asked: ClientAct, act: Hold, now: Now) -> list[Out]:
         """Note an answered beat. The first of a press is an act; the rest only keep it alive."""
-        desk, was_held = self._parts.desk, self._parts.desk.held
+        desk, was_held = self.desk, self.desk.held
         refusal = (
             desk.hold(asked.client, act.beat, act.press, asked.picture_ns, now.mono_ns)
-            if self._parts.operates
+            if self.operates
             else _ONLY_WATCHES
         )
         if refusal and was_held and not desk.held:
@@ -198,12 +190,12 @@ class Operation:
 
     def _do(self, asked: ClientAct, now: Now) -> tuple[str, str, list[Out]]:
         """Do an act of somebody who may. Returns why not, what it was about, and messages."""
-        act, parts = asked.act, self._parts
+        act = asked.act
         if isinstance(act, Take):
-            refusal = parts.desk.take(asked.client, act.name, now.mono_ns, asked.session)
+            refusal = self.desk.take(asked.client, act.name, now.mono_ns, asked.session)
             return refusal, act.name, self._teleop(now)
         if isinstance(act, Release):
-            parts.desk.release(asked.client, act.press)
+            self.desk.release(asked.client, act.press)
             return "", "", self._teleop(now)
         if isinstance(act, ChooseAttack):
             return self._choose(act.id, asked, now), act.id, []
@@ -222,21 +214,21 @@ class Operation:
         return refusal, "", outs
 
     def _leave(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
-        self._parts.desk.leave(asked.client)
+        self.desk.leave(asked.client)
         return "", self._teleop(now)
 
     def _stop(self, asked: ClientAct, act: Stop, now: Now) -> list[Out]:
         """Stop the car. Every admitted browser may do so; no rule of the desk applies. The e-stop stays latched."""
-        self._parts.desk.acted(asked.client, now.mono_ns)
+        self.desk.acted(asked.client, now.mono_ns)
         self._rearm_ns = None
         name = self._name(asked)
-        if not self._parts.operates:
+        if not self.operates:
             return [self._asker.disarm(now, f"{act.t} on a page that watches, by {name}")]
         if act.t == "estop":
             self._knows_latch = True
-            self._parts.desk.stop()
+            self.desk.stop()
             return [*self._teleop(now), self._asker.disarm(now, f"e-stop on the page by {name}")]
-        self._parts.desk.drop()
+        self.desk.drop()
         return [self._asker.disarm(now, f"on the page by {name}"), *self._teleop(now)]
 
     def _reset(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
@@ -244,36 +236,35 @@ class Operation:
 
         Without a held button that request cannot arm the car. So it is only sent if the safety node requires the button.
         """
-        refusal = self._parts.desk.reset(asked.client)
-        if not refusal and self._parts.launched.holds:
+        refusal = self.desk.reset(asked.client)
+        if not refusal and self.launched.holds:
             self._rearm_ns = now.mono_ns + _REARM_NS
         return refusal, self._teleop(now)
 
     def _start_trial(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
         """Begin a trial. The simulated car is put to the start; a real one must be carried there."""
-        parts = self._parts
-        if parts.board.armed or parts.desk.held:
+        if self.board.armed or self.desk.held:
             return "the car is armed; release the button first", []
-        parts.trial.start()
-        if not (parts.launched.twin and parts.start_pose):
+        self.trial.start()
+        if not (self.launched.twin and self.start_pose):
             return "", []
-        return "", [Out(RESET, pose_message(planar_pose(*parts.start_pose), now.real_ns))]
+        return "", [Out(RESET, pose_message(planar_pose(*self.start_pose), now.real_ns))]
 
     def _give_up_trial(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
-        if not self._parts.trial.end():
+        if not self.trial.end():
             return "no trial is running", []
         return "", self._end_trial("the trial was ended", now)
 
     def _end_trial(self, why: str, now: Now) -> list[Out]:
-        lease = self._parts.desk.lease
-        if self._parts.desk.drop():
+        lease = self.desk.lease
+        if self.desk.drop():
             return self._ended(why, lease.name if lease else "", now)
         return []
 
     def _choose(self, attack_id: str, asked: ClientAct, now: Now) -> str:
-        entry = self._parts.catalogue.get(attack_id)
+        entry = self.catalogue.get(attack_id)
         if entry is None:
-            return f"no attack {attack_id} among the {len(self._parts.catalogue)} of this page"
+            return f"no attack {attack_id} among the {len(self.catalogue)} of this page"
         try:
             chunks = chunk_messages(entry.file.read_bytes(), attack_id, now.real_ns)
         except (OSError, ValueError) as error:
@@ -291,32 +282,32 @@ class Operation:
         self._show, self._switched_by, self._switched_ns = show, self._name(asked), 0
 
     def _record(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
-        return self._parts.recording.start(), []
+        return self.recording.start(), []
 
     def _record_stop(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
-        return self._parts.recording.stop(), []
+        return self.recording.stop(), []
 
     def _label_refusal(self, now: Now) -> str:
         """Return why a label would be lost; empty if a recorder keeps it."""
-        if self._parts.recording.records or self._parts.board.hears(LAUNCH_RECORDER, now):
+        if self.recording.records or self.board.hears(LAUNCH_RECORDER, now):
             return ""
-        if self._parts.recording.starting:
+        if self.recording.starting:
             return "the recorder is still starting; label again in a second"
         return "nothing is being recorded, so the label would be lost; start recording first"
 
     def _ended(self, why: str, name: str, now: Now) -> list[Out]:
         """A hold ended by itself: report it before anything else."""
         self._why_ended = why
-        if lease := self._parts.desk.lease:
+        if lease := self.desk.lease:
             # Late answers to this press are not logged as separate acts.
-            self._refused_press = (lease.client, self._parts.desk.last_press)
+            self._refused_press = (lease.client, self.desk.last_press)
         return [*self._teleop(now), self._log(now, name, "let_go", why)]
 
     def _arming(self, now: Now) -> list[Out]:
         """Log who armed the car: the person whose held button the safety node has accepted."""
-        lease, was_armed = self._parts.desk.lease, self._was_armed
-        self._was_armed = self._parts.board.armed
-        if was_armed or not self._was_armed or lease is None or not self._parts.desk.held:
+        lease, was_armed = self.desk.lease, self._was_armed
+        self._was_armed = self.board.armed
+        if was_armed or not self._was_armed or lease is None or not self.desk.held:
             return []
         return [self._log(now, lease.name, "armed", "")]
 
@@ -324,14 +315,14 @@ class Operation:
         self.done += not refusal
         self.refused += bool(refusal)
         out = self._log(now, self._name(asked), act, detail, asked, refusal)
-        self._answer(asked.client, {"t": "answer", "act": act, "n": asked.act.n, "refused": refusal})
-        return [out] if self._parts.operates else []
+        self.answer(asked.client, {"t": "answer", "act": act, "n": asked.act.n, "refused": refusal})
+        return [out] if self.operates else []
 
     def _log(
         self, now: Now, name: str, act: str, detail: str, asked: ClientAct | None = None, refusal: str = ""
     ) -> Out:
         address, frame_ns = (asked.address, asked.frame_ns) if asked else ("", 0)
-        self._parts.diary.note(now, name, address, act, detail, frame_ns, refusal)
+        self.diary.note(now, name, address, act, detail, frame_ns, refusal)
         message = types.OperatorAct(
             header=header(now.real_ns),
             operator=name,
@@ -346,7 +337,7 @@ class Operation:
 
     def _teleop(self, now: Now) -> list[Out]:
         """Report the button and the e-stop at every change, and 20 times a second."""
-        desk = self._parts.desk
+        desk = self.desk
         said = (_AUTONOMY if desk.held else _IDLE, desk.estop)
         if said == self._told and now.mono_ns - self._told_ns < _TELEOP_NS:
             return []
@@ -378,16 +369,14 @@ class Operation:
 
     def _transfer_trouble(self, now: Now) -> str:
         """Why a chosen attack has not arrived; empty if it has, or may still."""
-        label = self._parts.board.label
+        label = self.board.label
         if not self._chosen or (label is not None and label.attack_id == self._chosen):
             return ""
         if now.mono_ns - self._chosen_ns < _TAKEN_S * NS_PER_S:
             return "sending"
-        said = "; ".join(
-            filter(None, (self._parts.board.status_text(name) for name in ("compositor", "monitor")))
-        )
+        said = "; ".join(filter(None, (self.board.status_text(name) for name in ("compositor", "monitor"))))
         return f"not taken over: {said or 'no compositor or monitor node reports'}"
 
     def _name(self, asked: ClientAct) -> str:
-        lease = self._parts.desk.lease
+        lease = self.desk.lease
         return lease.name if lease is not None and lease.client == asked.client else asked.name
