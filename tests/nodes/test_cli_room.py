@@ -18,7 +18,7 @@ from calibration.placement import face_frame
 from calibration.room import target_of_size
 from calibration.schema import RoomCalibration, TargetCalibration, load_calibration, save_calibration
 from nodes.bags.writer import BagWriter
-from nodes.lab.room.measured_request import write_measured_request
+from nodes.lab.room.placing import write_measured_request
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import encode, pose_message
