@@ -55,7 +55,6 @@ class Sessions:
 
     code_s: float = 300.0
     code: str = ""
-    refused: int = 0
     _code_ns: int = 0
     _turn_ns: int = 0
     _guessers: dict[str, _Guesser] = field(default_factory=dict)
@@ -91,7 +90,6 @@ class Sessions:
         fresh = bool(self.code) and mono_ns - self._code_ns <= self.code_s * NS_PER_S
         right = hmac.compare_digest(given, self.code.encode())
         if not (fresh and right):
-            self.refused += 1
             guesser = self._guesser(address)
             guesser.wrong += 1
             if (excess := guesser.wrong - _FREE_GUESSES) >= 0:

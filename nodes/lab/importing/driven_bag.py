@@ -50,8 +50,7 @@ class DrivenFrames:
     """Frames on disk with their poses.
 
     Attributes:
-        files: Image files in order of time.
-        stamps_ns: Capture stamps [ns since 1970].
+        files: Image files in order of time, named by their capture stamps [ns since 1970].
         T_world_from_camera: ``[N, 4, 4]`` in the motion-capture world.
         recorded: Number of frames in the bag.
         without_pose: Number of frames that were skipped because motion capture had a gap.
@@ -59,7 +58,6 @@ class DrivenFrames:
     """
 
     files: tuple[Path, ...]
-    stamps_ns: tuple[int, ...]
     T_world_from_camera: Array
     calibration: CameraCalibration
     recorded: int
@@ -99,11 +97,9 @@ def take_frames(
     chosen = choose_by_motion(np.stack([T for _, _, T in placed]), config)
     wanted = {placed[i][0]: placed[i] for i in chosen}
     files = _write_frames(bag, topic, folder, wanted, camera, report)
-    rows = [wanted[index] for index in sorted(wanted)]
     return DrivenFrames(
         tuple(files),
-        tuple(stamp for _, stamp, _ in rows),
-        np.stack([T for _, _, T in rows]),
+        np.stack([wanted[index][2] for index in sorted(wanted)]),
         camera,
         len(stamps),
         len(stamps) - len(placed),
