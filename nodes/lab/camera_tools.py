@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.data.image_files import write_image
 from advnerf_core.documents import Document, parse_yaml
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_atomically
 from advnerf_core.strict import parse_value
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.cameras.interface import Frame
@@ -116,12 +116,9 @@ def save_picture(rgb: NDArray[np.uint8], file: Path) -> None:
         CameraToolError: The file name does not have the suffix of an image format.
     """
     try:
-        done, data = cv2.imencode(file.suffix, rgb[:, :, ::-1])
-    except cv2.error:
-        done = False
-    if not done:
-        raise CameraToolError(f"expected a file name that ends in .png or .jpg; got {file}")
-    write_atomically(file, data.tobytes())
+        write_image(file, rgb)
+    except (cv2.error, ValueError):
+        raise CameraToolError(f"expected a file name that ends in .png or .jpg; got {file}") from None
 
 
 def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> SourceTrial:

@@ -43,9 +43,6 @@ def ask(
         every_s: Time between two repeats [s].
         patience_s: Time after which `NoAnswerError` is raised [s].
 
-    Returns:
-        The result of `read`.
-
     Raises:
         NoAnswerError: No answer within the patience.
         BusError: Other processes published the topic during the whole time.

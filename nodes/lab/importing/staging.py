@@ -42,9 +42,6 @@ def build_beside(
         media: Input files, which must not be in the replaced folders.
         resumes: Whether a failed or stopped import may keep its work folder. Otherwise it is always removed.
 
-    Returns:
-        The result of ``build``.
-
     Raises:
         ImportRecordingError: A folder has other files, another import is running, or ``build`` failed and its work is kept.
     """
