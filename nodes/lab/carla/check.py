@@ -41,13 +41,15 @@ def check_server(
     checks: list[CheckFinding] = []
 
     def look(name: str, what: Callable[[], Any]) -> Any:
-        """The result of a check, or None if it failed, which is recorded."""
+        """What a check finds, or None if it failed, which is recorded, as its findings are."""
         try:
             with server_answers(name):
                 found = what()
         except CarlaError as error:
             checks.append(CheckFinding(name, "failure", str(error)))
             return None
+        if isinstance(found, CheckFinding):
+            checks.append(found)
         return found
 
     module = library if library is not None else look("client library", load_carla)
@@ -59,38 +61,34 @@ def check_server(
     where = f"CARLA {client.get_server_version()} at {config.server.host}:{config.server.port}, as the client library"
     checks.append(CheckFinding("server", "ok", where))
     world = look("map", client.get_world)
-    if world is None or not _look_at_map(config, client, world, checks):
+    if world is None:
         return checks
-    if look("junction", lambda: _look_at_junction(config, world, module, checks)) is None:
+    checks.append(_look_at_map(config, client, world))
+    if checks[-1].state != "ok" or look("junction", lambda: _look_at_junction(config, world, module)) is None:
         return checks
-    if look("world", lambda: _look_at_world(config, world, checks)) is None:
+    if look("world", lambda: _look_at_world(config, world)) is None:
         return checks
-    look("blueprints", lambda: _look_at_blueprints(config, world, checks))
+    look("blueprints", lambda: _look_at_blueprints(config, world))
     if all(check.met for check in checks):
         look("pictures", lambda: _look_at_pictures(config, module, pictures, checks))
-        look("put back", lambda: _look_at_settings(world, checks))
+        look("put back", lambda: _look_at_settings(world))
     return checks
 
 
-def _look_at_map(config: CarlaConfig, client: Any, world: Any, checks: list[CheckFinding]) -> bool:
-    """Whether the requested map is loaded."""
+def _look_at_map(config: CarlaConfig, client: Any, world: Any) -> CheckFinding:
     loaded, wanted = map_name(world.get_map().name), config.server.town
     if wanted in (None, loaded):
-        checks.append(CheckFinding("map", "ok", loaded))
-        return True
+        return CheckFinding("map", "ok", loaded)
     if wanted not in {map_name(path) for path in client.get_available_maps()}:
         text = f"expected {wanted}, got {loaded}, and the server does not have {wanted}"
-        checks.append(CheckFinding("map", "failure", text))
-    elif config.server.load_town:
+        return CheckFinding("map", "failure", text)
+    if config.server.load_town:
         text = f"{loaded}; an experiment would load {wanted}. To look at that: ask with --set server.town={loaded}, or load it first"
-        checks.append(CheckFinding("map", "warning", text))
-    else:
-        text = f"expected {wanted}, got {loaded}, and server.load_town is off"
-        checks.append(CheckFinding("map", "failure", text))
-    return False
+        return CheckFinding("map", "warning", text)
+    return CheckFinding("map", "failure", f"expected {wanted}, got {loaded}, and server.load_town is off")
 
 
-def _look_at_junction(config: CarlaConfig, world: Any, library: Any, checks: list[CheckFinding]) -> bool:
+def _look_at_junction(config: CarlaConfig, world: Any, library: Any) -> CheckFinding:
     drives = drives_in(world.get_map(), library, config)
     lengths = ", ".join(f"{name} {path.length_m:.1f} m" for name, path in drives.paths.items())
     side = "right" if drives.right_hand else "left"
@@ -98,17 +96,15 @@ def _look_at_junction(config: CarlaConfig, world: Any, library: Any, checks: lis
         f"{drives.junction_id}: {lengths}; lanes {drives.lane_width_m:.2f} m, traffic on the {side}, heights within "
         f"{drives.height_range_m:.2f} m"
     )
-    checks.append(CheckFinding("junction", "ok" if drives.right_hand else "warning", text))
-    return True
+    return CheckFinding("junction", "ok" if drives.right_hand else "warning", text)
 
 
-def _look_at_world(config: CarlaConfig, world: Any, checks: list[CheckFinding]) -> bool:
+def _look_at_world(config: CarlaConfig, world: Any) -> CheckFinding:
     check_nobody_else(world, config.server)
-    checks.append(CheckFinding("world", "ok", "nobody else drives it or is in it"))
-    return True
+    return CheckFinding("world", "ok", "nobody else drives it or is in it")
 
 
-def _look_at_blueprints(config: CarlaConfig, world: Any, checks: list[CheckFinding]) -> bool:
+def _look_at_blueprints(config: CarlaConfig, world: Any) -> CheckFinding:
     for kind in (RGB, DEPTH):
         camera_blueprint(world, kind, config.camera.pinhole, config.render)
     vehicle = config.body.blueprint
@@ -117,15 +113,12 @@ def _look_at_blueprints(config: CarlaConfig, world: Any, checks: list[CheckFindi
             world.get_blueprint_library().find(vehicle)
         except IndexError as error:
             raise CarlaMapError(f"expected the vehicle {vehicle} (body.blueprint), got: {error}") from error
-    checks.append(
-        CheckFinding("blueprints", "ok", f"{RGB}, {DEPTH}, {vehicle or 'no vehicle'}, with all attributes")
-    )
-    return True
+    return CheckFinding("blueprints", "ok", f"{RGB}, {DEPTH}, {vehicle or 'no vehicle'}, with all attributes")
 
 
 def _look_at_pictures(
     config: CarlaConfig, library: Any, folder: Path | None, checks: list[CheckFinding]
-) -> bool:
+) -> None:
     with CarlaScene(config, library) as scene:
         scene.reset(*scene.paths["straight"].start_pose)
         rgb, depth = require_depth(scene.observe())
@@ -141,7 +134,6 @@ def _look_at_pictures(
         if folder is not None:
             _write(folder, rgb, depth)
         checks.append(_ground(scene.camera_pinhole, scene.T_car_from_camera, rgb, depth))
-    return True
 
 
 def _ground(
@@ -166,14 +158,13 @@ def _ground(
     return CheckFinding("depth", "failure", text)
 
 
-def _look_at_settings(world: Any, checks: list[CheckFinding]) -> bool:
+def _look_at_settings(world: Any) -> CheckFinding:
     settings = world.get_settings()
     if settings.synchronous_mode:
         raise CarlaFrameError(
             "expected the world to tick by itself again, it does not: `advnerf scene carla release`"
         )
-    checks.append(CheckFinding("put back", "ok", "the world ticks by itself again"))
-    return True
+    return CheckFinding("put back", "ok", "the world ticks by itself again")
 
 
 def _write(folder: Path, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> None:
