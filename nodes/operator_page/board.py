@@ -193,21 +193,18 @@ class ViewState:
 
     def _steering(self, now: Now) -> dict[str, Any] | None:
         compared, drive = self._message(COUNTERFACTUAL), self._message(DRIVE)
-        if compared is not None:
-            return {
-                "clean_rad": _finite(compared.clean_rad),
-                "attacked_rad": _finite(compared.attacked_rad),
-                "drawn": bool(compared.drawn),
-                "age_s": self._age_s(COUNTERFACTUAL, now),
-            }
-        if drive is None:
+        if compared is None and drive is None:
             return None
-        angle_rad = _finite(drive.drive.steering_angle)
+        clean, attacked = (
+            (None, drive.drive.steering_angle)
+            if compared is None
+            else (_finite(compared.clean_rad), compared.attacked_rad)
+        )
         return {
-            "clean_rad": None,
-            "attacked_rad": angle_rad,
-            "drawn": False,
-            "age_s": self._age_s(DRIVE, now),
+            "clean_rad": clean,
+            "attacked_rad": _finite(attacked),
+            "drawn": compared is not None and bool(compared.drawn),
+            "age_s": self._age_s(DRIVE if compared is None else COUNTERFACTUAL, now),
         }
 
     def _attack(self, now: Now) -> dict[str, Any] | None:
@@ -264,16 +261,11 @@ class ViewState:
         return [
             {
                 "name": str(row.name),
-                "level": _LEVELS.get(_level(row.level), "error"),
+                "level": _LEVELS.get(int(row.level), "error"),
                 "text": str(row.message)[:200],
             }
             for row in message.status
         ]
-
-
-def _level(level: Any) -> int:
-    """A level of ``diagnostic_msgs``, which is a byte."""
-    return level[0] if isinstance(level, bytes) else int(level)
 
 
 def _finite(value: Any, digits: int = 4) -> float | None:
