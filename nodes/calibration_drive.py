@@ -30,9 +30,7 @@ class Manoeuvre:
     """A command that is held for some time.
 
     Attributes:
-        duration_s: Duration [s].
         steering_rad: Wheel angle, left positive [rad].
-        speed_mps: Speed [m/s].
     """
 
     duration_s: float

@@ -40,7 +40,6 @@ class PluginRow:
     """One named plug-in.
 
     Attributes:
-        line: Description in one sentence.
         origin: ``built in``, or package and version.
     """
 

@@ -48,7 +48,6 @@ def drive_round(
 
     Args:
         policy: A policy in eval mode.
-        room: Path, fence and off-track limit.
     """
     path, count = room.reference_path, _STARTS
     starts = torch.from_numpy(path.pose_at(np.arange(count) / count * path.length_m))

@@ -64,9 +64,7 @@ def from_twin(view: PolicyView, count: int = 48) -> ReferenceFrames:
     from hardware.worlds.lab.config import LabConfig
     from hardware.worlds.lab.lab import Lab
 
-    expert = Expert(
-        load_calibration(RoomCalibration, shipped("calibration/twin") / "room.yaml").reference_path
-    )
+    expert = _expert(shipped("calibration/twin") / "room.yaml")
     poses = _about_the_path(expert, count)
 
     def frame(lab: Lab, x_m: float, y_m: float, yaw_rad: float) -> NDArray[np.uint8]:
@@ -94,7 +92,7 @@ def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Refere
     topic = image_topic(bag)
     recorded = next(row.count for row in read_info(bag).topics if row.name == topic)
     wanted = set(np.linspace(0, recorded - 1, min(count, recorded)).astype(int).tolist())
-    expert = Expert(load_calibration(RoomCalibration, room).reference_path)
+    expert = _expert(room)
     images, steering = [], []
     for number, image in enumerate(image_messages(bag, topic)):
         if number not in wanted:
@@ -135,7 +133,7 @@ def from_run(folder: Path, view: PolicyView) -> ReferenceFrames:
             "give another folder, a bag (--bag) or a scene (--scene)"
         )
     camera = _camera(view, calibration)
-    expert = Expert(load_calibration(RoomCalibration, calibration / "room.yaml").reference_path)
+    expert = _expert(calibration / "room.yaml")
     images, steering = [], []
     for name in ("held_out", "colour_pairs"):
         if not (capture / name / "transforms.json").is_file():
@@ -162,7 +160,7 @@ def from_scene(scene: Path, calibration: Path, view: PolicyView, count: int = 48
         calibration: Folder with ``camera.yaml``, ``room.yaml`` and ``vehicle.yaml``.
     """
     _camera(view, calibration)
-    expert = Expert(load_calibration(RoomCalibration, calibration / "room.yaml").reference_path)
+    expert = _expert(calibration / "room.yaml")
     poses = _about_the_path(expert, count)
     seen = _sight_of_scene(scene, calibration, view)(torch.from_numpy(poses))
     images = np.round(255.0 * seen.permute(0, 2, 3, 1).clamp(0.0, 1.0).numpy()).astype(np.uint8)
@@ -197,6 +195,10 @@ def _camera(view: PolicyView, calibration: Path) -> CameraCalibration:
     camera = load_calibration(CameraCalibration, calibration / "camera.yaml")
     require_camera(view, camera.pinhole, "", calibration / "camera.yaml")
     return camera
+
+
+def _expert(room: Path) -> Expert:
+    return Expert(load_calibration(RoomCalibration, room).reference_path)
 
 
 def _about_the_path(expert: Expert, count: int) -> NDArray[np.float64]:

@@ -80,8 +80,6 @@ class Client:
     """One connected browser. Only the server's thread uses it.
 
     Args:
-        number: Number of the connection.
-        session: Public name of the browser's session.
         name: Name of its person. Taking control gives a new one.
     """
 

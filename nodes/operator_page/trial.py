@@ -24,7 +24,6 @@ class Trial:
     Args:
         path: Reference path; None leaves out the metrics.
         off_track_m: Cross-track error beyond which the car is off the track [m].
-        ticks: Length in control ticks.
     """
 
     def __init__(

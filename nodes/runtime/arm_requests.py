@@ -25,7 +25,6 @@ class ArmAnswer:
     """The answer to a request.
 
     Attributes:
-        granted: Whether the safety node granted it.
         armed: Whether the car is armed after the request.
         text: Why the car is not armed, or who armed it.
         braked: Whether the motor node has reported since then that it brakes. Only set by a request to disarm.

@@ -24,8 +24,7 @@ from nodes.runtime.message_types import MSG_FOLDER, MessageTypes
 ROS_DISTRO = "jazzy"
 # Far above every message of advnerf. A corrupt length field must not make a receiver allocate gigabytes.
 MAX_SEQUENCE_LENGTH = 64 * 1024 * 1024
-_RGB8, _MONO8, _BGR8 = "rgb8", "mono8", "bgr8"
-_CHANNELS = {_RGB8: 3, _BGR8: 3, _MONO8: 1}
+_CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 
 
 _TYPES = MessageTypes(MAX_SEQUENCE_LENGTH)

@@ -26,7 +26,6 @@ class Share:
     """The share that a process got.
 
     Attributes:
-        nice: Nice value of the process.
         autogroup: Nice value of its session; None without autogrouping, or in a session of other processes.
     """
 

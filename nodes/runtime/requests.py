@@ -22,7 +22,6 @@ class RequestIdentity:
     """Identity of a request, which is the same in all its repeats.
 
     Attributes:
-        ask_id: Id of the request.
         mono_ns: Time of the first repeat, monotonic clock of the sender [ns].
         real_ns: Time of the first repeat, CLOCK_REALTIME [ns].
     """
@@ -46,7 +45,6 @@ class Answer:
     """Decision of a node about a request.
 
     Attributes:
-        ask_id: Id of the request.
         granted: Whether the node did what the request asked for.
         text: Action of the node, or its reason for refusing.
     """

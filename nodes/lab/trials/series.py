@@ -44,7 +44,6 @@ class Series:
 
     Attributes:
         folder: Folder for the plan, the results and one folder per run.
-        room: Reference path and limits.
         nodes: Nodes that must be ready before anything moves.
     """
 
@@ -74,10 +73,8 @@ def prepare_series(
 
     Args:
         launch_file: Node graph with a safety node, whose room is used, and a recorder.
-        overrides: ``node.key=value`` and ``params.name=value``.
         folder: New folder, or the same series' folder.
         attacks: Attack files of each condition besides ``none``.
-        ticks: Control ticks of each drive, at 10 Hz.
         start_pose: Start pose of each drive; None uses the room's.
         host: Host of the launch file that this computer is, or all. It must be the operator's host, with the recorder.
 

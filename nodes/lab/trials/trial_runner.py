@@ -41,7 +41,6 @@ def run_trial(
 
     Args:
         launch_file: The node graph, which records a bag.
-        overrides: ``node.key=value`` and ``params.name=value``.
         run_dir: Folder of the run for ``trial.json``, the bag and the logs.
         guide: Called with instructions for the operator of a real car.
         host: Host of the launch file that this computer is. The other host must be running.

@@ -83,7 +83,6 @@ class MeasuredPrint:
     """A measured print, and its picture.
 
     Attributes:
-        measurement: Sizes, poses, residuals.
         colours: The rectified picture; None where the exposure or the view does not show its colours.
         by_car: Whether the driving camera took it, so that the policy sees these colours.
     """
