@@ -10,7 +10,7 @@ import math
 import threading
 import time
 from collections import deque
-from dataclasses import replace
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +35,6 @@ from hardware.worlds.lab.lab import Lab
 _LONGEST_STEP_S = 0.5
 _HISTORY_S = 2.0
 _HELD_UP_S = 0.2
-CAMERA_FAULTS = ("silent", "repeated")
 
 
 class LiveLabConfig(StrictModel):
@@ -127,6 +126,10 @@ class LiveLab:
         run_dir: Folder for the link and the log.
         socket_dir: Folder for the socket, whose path may have at most 107 characters; None uses the run folder.
         ready_timeout_s: Limit for building the world [s].
+
+    Attributes:
+        vesc: The motor controller, with its wire log.
+        vicon: The motion capture system.
     """
 
     def __init__(
@@ -143,47 +146,29 @@ class LiveLab:
         self._stop = threading.Event()
         self._ready = threading.Event()
         self._failure: BaseException | None = None
-        self._camera_fault: str | None = None
         self._history = PoseHistory(config.physics_rate_hz)
         self._physics_pacer = Pacer(config.physics_rate_hz)
         self._camera_pacer = Pacer(config.lab.camera.rate_hz)
-        self._threads: list[threading.Thread] = []
-        self._frames = FrameServer(self.frames_path)
-        self._monitor: MonitorPort | None = None
-        self._vesc: VescEmulator | None = None
-        self._vicon: ViconEmulator | None = None
+        self._opened = ExitStack()
         try:
+            self._frames = FrameServer(self.frames_path)
+            self._opened.callback(self._frames.close)
             panel = config.lab.monitor
             self._monitor = MonitorPort(self.monitor_path, (panel.width_m, panel.height_m))
+            self._opened.callback(self._monitor.close)
             car = vehicle_in_room(config.lab)
             car.reset(*config.start_pose)
-            self._vesc = VescEmulator(config.vesc, car, self.vesc_port, run_dir / "vesc_wire.csv")
+            self.vesc = VescEmulator(config.vesc, car, self.vesc_port, run_dir / "vesc_wire.csv")
+            self._opened.callback(self.vesc.close)
             self._start(self._run_physics, "twin physics")
             self._start(self._run_camera, "twin camera")
             self._wait_until_ready(ready_timeout_s)
             # Last: who sees poses may count on pictures.
-            self._vicon = ViconEmulator(config.vicon, self._subject_poses)
+            self.vicon = ViconEmulator(config.vicon, self._subject_poses)
+            self._opened.callback(self.vicon.close)
         except BaseException:
             self.close()
             raise
-
-    @property
-    def vesc(self) -> VescEmulator:
-        """The motor controller, with its wire log."""
-        assert self._vesc is not None
-        return self._vesc
-
-    @property
-    def vicon(self) -> ViconEmulator:
-        """The motion capture system, with its faults to inject."""
-        assert self._vicon is not None
-        return self._vicon
-
-    def freeze_camera(self, fault: str | None) -> None:
-        """Make the camera ``silent``, or make it repeat its last frame with its old stamp (``repeated``); None ends the fault."""
-        if fault not in (None, *CAMERA_FAULTS):
-            raise ValueError(f"expected a fault of {', '.join(CAMERA_FAULTS)}, got {fault!r}")
-        self._camera_fault = fault
 
     @property
     def state(self) -> VehicleState:
@@ -193,8 +178,11 @@ class LiveLab:
     @property
     def missed(self) -> dict[str, int]:
         """Number of skipped ticks because a thread was delayed."""
-        missed = {"camera": self._camera_pacer.missed, "physics": self._physics_pacer.missed}
-        return missed if self._vicon is None else {**missed, "vicon": self._vicon.missed}
+        return {
+            "camera": self._camera_pacer.missed,
+            "physics": self._physics_pacer.missed,
+            "vicon": self.vicon.missed,
+        }
 
     def check(self) -> None:
         """Raise the error that ended a thread of the lab."""
@@ -209,15 +197,7 @@ class LiveLab:
     def close(self) -> None:
         """Stop all threads and remove the link and the socket."""
         self._stop.set()
-        if self._vicon is not None:
-            self._vicon.close()
-        for thread in self._threads:
-            thread.join(timeout=5.0)
-        self._frames.close()
-        if self._monitor is not None:
-            self._monitor.close()
-        if self._vesc is not None:
-            self._vesc.close()
+        self._opened.close()
 
     def __enter__(self) -> LiveLab:
         return self
@@ -227,8 +207,8 @@ class LiveLab:
 
     def _start(self, run: object, name: str) -> None:
         thread = threading.Thread(target=self._guard, args=(run,), name=name, daemon=True)
-        self._threads.append(thread)
         thread.start()
+        self._opened.callback(thread.join, timeout=5.0)
 
     def _guard(self, run: object) -> None:
         try:
@@ -258,7 +238,6 @@ class LiveLab:
             lab.observe(depth=False)  # the first picture pays for compiling shaders
             self._ready.set()
             sequence, last_ns = 0, 0
-            last: Frame | None = None
             camera = ImperfectCamera(self.config.camera_effects, lab.camera_pinhole)
 
             def drawn(pose: Array) -> Rgb:
@@ -273,24 +252,15 @@ class LiveLab:
                 rgb = camera.see(drawn, pose, (tick_ns - last_ns) / NS_PER_S)
                 last_ns = tick_ns
                 self._hold_until(tick_ns + round(self.config.camera_latency_s * NS_PER_S))
-                if rgb is None:  # lost on the way: its number is missing
-                    sequence += 1
-                    continue
-                frame = Frame(rgb, real_ns, tick_ns, sequence)
-                if self._camera_fault is None:
-                    self._frames.publish(last := frame)
-                    sequence += 1
-                elif self._camera_fault == "repeated" and last is not None:
-                    self._frames.publish(
-                        replace(last)
-                    )  # a new object: the server distinguishes frames by identity
+                if rgb is not None:  # else lost on the way: its number is missing
+                    self._frames.publish(Frame(rgb, real_ns, tick_ns, sequence))
+                sequence += 1
 
     def _hold_until(self, mono_ns: int) -> None:
         if (rest_ns := mono_ns - time.monotonic_ns()) > 0:
             self._stop.wait(rest_ns / NS_PER_S)
 
     def _light_monitor(self, lab: Lab) -> None:
-        assert self._monitor is not None
         changed, shown = self._monitor.take()
         if changed:
             lab.set_monitor_image(shown)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import random
 import select
 import threading
 import time
@@ -19,10 +18,8 @@ from typing import TextIO
 
 from advnerf_core.geometry import VehicleState
 from hardware.emulators.vesc_firmware import VescEmulatorConfig, VescFirmware, WireEvent
-from hardware.emulators.vesc_wire import require_wire_fault, wire_chunks
 from hardware.errors import HardwareError
-from hardware.motor.vesc_settings import TimeoutSettings
-from hardware.worlds.lab.vehicle import TwinVehicle, require_jam
+from hardware.worlds.lab.vehicle import TwinVehicle
 
 # Below this speed the car counts as standing.
 STANDSTILL_MPS = 0.005
@@ -36,6 +33,9 @@ class VescEmulator:
         vehicle: The car; from now on only this object may move it.
         link: Path for a symbolic link to the terminal, e.g. ``<run_dir>/vesc``; an old link is replaced.
         log: CSV file for the wire log; None keeps it in memory only.
+
+    Attributes:
+        firmware: The controller's firmware.
     """
 
     def __init__(
@@ -46,18 +46,15 @@ class VescEmulator:
         log: Path | None = None,
     ) -> None:
         self.vehicle = vehicle
-        self._firmware = VescFirmware(config, vehicle, vehicle.params.true_erpm_gain)
+        self.firmware = VescFirmware(config, vehicle, vehicle.params.true_erpm_gain)
         self._lock = threading.RLock()
         self._events: deque[WireEvent] = deque(maxlen=100_000)
         self._moving = False
-        self._jam: tuple[str | None, int] | None = None
         self._log: TextIO | None = None
         if log is not None:
             self._log = open(log, "w", buffering=1, encoding="ascii")  # noqa: SIM115 - closed in close()
             self._log.write(LOG_HEADER)
         self._link = link
-        self._fault: str | None = None
-        self._rng = random.Random(0)  # repeatable noise on the wire
         self._stop_read, self._stop_write = os.pipe()
         self._open = True
         self._master = self._slave = -1
@@ -65,32 +62,10 @@ class VescEmulator:
         self.plug_in()
 
     @property
-    def config(self) -> VescEmulatorConfig:
-        """Settings of the controller."""
-        return self._firmware.config
-
-    @property
     def state(self) -> VehicleState:
         """Current state of the car."""
         with self._lock:
             return self.vehicle.state
-
-    @property
-    def timeout(self) -> TimeoutSettings:
-        """The controller's stored time-out and brake current."""
-        return self._firmware.timeout
-
-    def report_fault(self, code: int) -> None:
-        """Make the controller report a fault and ignore commands to move; 0 ends it."""
-        with self._lock:
-            self._firmware.fault = code
-            if code:
-                self.vehicle.command(current_a=0.0)
-
-    @property
-    def timed_out(self) -> bool:
-        """Whether the firmware's time-out is active."""
-        return self._firmware.timed_out
 
     def events(self, since_mono_ns: int = 0) -> list[WireEvent]:
         """Events on the wire, oldest first."""
@@ -100,10 +75,7 @@ class VescEmulator:
     def advance(self, dt_s: float, mono_ns: int) -> VehicleState:
         """Move the car by ``dt_s`` up to monotonic time ``mono_ns`` [ns] and run the firmware's watchdog."""
         with self._lock:
-            self._note(self._firmware.check_timeout(mono_ns))
-            if self._jam is not None and mono_ns >= self._jam[1]:
-                self.vehicle.jam(self._jam[0])
-                self._jam = None
+            self._note(self.firmware.check_timeout(mono_ns))
             state = self.vehicle.advance(dt_s)
             moving = abs(state.speed_mps) > STANDSTILL_MPS
             if moving != self._moving:
@@ -115,28 +87,13 @@ class VescEmulator:
         """Put the car at another pose; refused while it moves or has a motor command."""
         with self._lock:
             speed = self.vehicle.state.speed_mps
-            if self._firmware.commanded or abs(speed) > 0.05:
+            if self.firmware.commanded or abs(speed) > 0.05:
                 raise HardwareError(
                     f"expected a car at rest, got {speed:.2f} m/s"
-                    f"{' and an active motor command' if self._firmware.commanded else ''}; disarm first"
+                    f"{' and an active motor command' if self.firmware.commanded else ''}; disarm first"
                 )
             self.vehicle.reset(x_m, y_m, yaw_rad)
             self._note([WireEvent(time.monotonic_ns(), "PLACED")])
-
-    def jam(self, how: str | None) -> None:
-        """Jam the car from now on, see `TwinVehicle.jam`; None releases it.
-
-        A delayed step up to an earlier time is made without the jam: the log must not show an effect before its cause.
-        """
-        require_jam(how)
-        with self._lock:
-            self._jam = how, time.monotonic_ns()
-
-    def disturb(self, fault: str | None) -> None:
-        """Let replies reach the computer with a fault of `WIRE_FAULTS`; None repairs the wire."""
-        require_wire_fault(fault)
-        with self._lock:
-            self._fault = fault
 
     def plug_in(self) -> None:
         """Connect the USB plug (again): another terminal, under the same link."""
@@ -196,11 +153,9 @@ class VescEmulator:
             except BlockingIOError:
                 continue
             with self._lock:
-                replies, events = self._firmware.receive(data, time.monotonic_ns())
+                replies, events = self.firmware.receive(data, time.monotonic_ns())
                 self._note(events)
-                chunks = wire_chunks(replies, self._fault, self._rng)
-            for chunk in chunks:
-                self._reply(chunk)
+            self._reply(replies)
 
     def _reply(self, data: bytes) -> None:
         # Without a reader the bytes are lost, as on a USB endpoint without a host.

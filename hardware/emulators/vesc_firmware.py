@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 from pydantic import Field
 
@@ -17,6 +16,7 @@ from advnerf_core.strict import StrictModel
 from hardware.motor.vesc_codec import Command, CommandId, FrameDecoder, decode_command, encode_frame
 from hardware.motor.vesc_replies import FirmwareVersion, Values, encode_firmware_version, encode_values
 from hardware.motor.vesc_settings import AppConfiguration, TimeoutSettings, decode_app_configuration
+from hardware.worlds.lab.vehicle import TwinVehicle
 
 TWIN_HARDWARE_NAME = "TWIN"
 _TIMEOUT_CHECK_NS = 10_000_000
@@ -57,32 +57,6 @@ class VescEmulatorConfig(StrictModel):
     readable_settings: bool = True
 
 
-class Plant(Protocol):
-    """The motor, servo and car behind the controller."""
-
-    @property
-    def erpm(self) -> float:
-        """Measured electrical rpm."""
-        ...
-
-    @property
-    def odometer_m(self) -> float:
-        """Distance driven, reverse negative [m]."""
-        ...
-
-    def command(
-        self,
-        *,
-        servo: float | None = None,
-        erpm: float | None = None,
-        duty: float | None = None,
-        current_a: float | None = None,
-        brake_current_a: float | None = None,
-    ) -> None:
-        """Change the servo target or the motor mode."""
-        ...
-
-
 @dataclass(frozen=True)
 class WireEvent:
     """An event at the controller.
@@ -110,7 +84,7 @@ class VescFirmware:
         commanded: Whether the last motor command makes the car move.
     """
 
-    def __init__(self, config: VescEmulatorConfig, plant: Plant, erpm_per_mps: float = 4614.0) -> None:
+    def __init__(self, config: VescEmulatorConfig, plant: TwinVehicle, erpm_per_mps: float = 4614.0) -> None:
         self.config = config
         self._plant = plant
         # Six counts per electrical revolution.
@@ -123,11 +97,6 @@ class VescFirmware:
         self.fault = 0
         self.timed_out = False
         self.commanded = False
-
-    @property
-    def skipped_bytes(self) -> int:
-        """Number of received bytes outside of frames."""
-        return self._decoder.skipped_bytes
 
     @property
     def timeout(self) -> TimeoutSettings:

@@ -1,13 +1,11 @@
 """Motion capture of the twin: sends Vicon Tracker's object stream for poses from a function.
 
-It adds the noise of a real measurement, without which a standing object would count as frozen, and produces every
-known form of occlusion, loss and restart on request.
+It adds the noise of a real measurement, without which a standing object would count as frozen, and the faults of a network.
 """
 
 from __future__ import annotations
 
 import contextlib
-import math
 import socket
 import threading
 from collections.abc import Callable, Mapping
@@ -19,9 +17,6 @@ from advnerf_core.geometry import Array, make_transform, rotation_x, rotation_y,
 from advnerf_core.strict import StrictModel
 from hardware.emulators.pacing import Pacer
 from hardware.mocap.vicon_codec import ObjectPose, encode_blocks, object_pose
-
-OCCLUSION_FORMS = ("missing", "zeros", "nan", "frozen")
-_NOWHERE_ELSE = np.eye(4)
 
 
 class ViconEmulatorConfig(StrictModel):
@@ -66,33 +61,10 @@ class ViconFrames:
         # A separate generator, so that network faults do not change the noise of the measurements.
         self._network = np.random.default_rng([config.seed, 1])
         self._held_back: list[bytes] = []
-        self._occluded: dict[str, str] = {}
-        self._displaced: dict[str, Array] = {}
-        self._last: dict[str, ObjectPose] = {}
-
-    def occlude(self, name: str, form: str | None) -> None:
-        """Hide a subject in one of `OCCLUSION_FORMS`, or show it again with None."""
-        if form is None:
-            self._occluded.pop(name, None)
-        elif form in OCCLUSION_FORMS:
-            self._occluded[name] = form
-        else:
-            raise ValueError(f"expected a form of occlusion of {', '.join(OCCLUSION_FORMS)}, got {form!r}")
-
-    def displace(self, name: str, T_there_from_true: Array | None) -> None:
-        """Report a subject displaced by a transform ``[4, 4]`` in the world; None reports the truth again."""
-        if T_there_from_true is None:
-            self._displaced.pop(name, None)
-        else:
-            self._displaced[name] = np.array(T_there_from_true, dtype=np.float64)
 
     def next(self, T_world_from_subject: Mapping[str, Array]) -> list[bytes]:
         """Datagrams of the next frame for true poses ``[4, 4]`` [m]."""
-        objects = []
-        for name, T in T_world_from_subject.items():
-            if (item := self._seen(name, self._displaced.get(name, _NOWHERE_ELSE) @ T)) is not None:
-                self._last[name] = item
-                objects.append(item)
+        objects = [self._measured(name, T) for name, T in T_world_from_subject.items()]
         if self.config.shuffle:
             objects = [objects[i] for i in self._network.permutation(len(objects))]
         datagrams = encode_blocks(self.frame_number, objects, self.config.block_bytes)
@@ -110,16 +82,7 @@ class ViconFrames:
                 sent += [datagram] * (1 + int(twice))
         return sent + late
 
-    def _seen(self, name: str, T: Array) -> ObjectPose | None:
-        form = self._occluded.get(name)
-        if form == "missing":
-            return None
-        if form == "zeros":
-            return ObjectPose(name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        if form == "nan":
-            return ObjectPose(name, (math.nan,) * 3, (math.nan,) * 3)
-        if form == "frozen" and name in self._last:
-            return self._last[name]
+    def _measured(self, name: str, T: Array) -> ObjectPose:
         rx, ry, rz = self._rng.normal(0.0, self.config.noise_rad, 3) if self.config.noise_rad else np.zeros(3)
         noise = make_transform(
             rotation_z(rz) @ rotation_y(ry) @ rotation_x(rx),
@@ -142,7 +105,6 @@ class ViconEmulator:
         self.config = config
         self._frames = ViconFrames(config)
         self._poses = poses
-        self._lock = threading.Lock()
         self._stop = threading.Event()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
@@ -155,21 +117,6 @@ class ViconEmulator:
         """Number of skipped frames because the thread was delayed."""
         return self._pacer.missed
 
-    def occlude(self, name: str, form: str | None) -> None:
-        """Hide a subject in one of `OCCLUSION_FORMS`, or show it again with None."""
-        with self._lock:
-            self._frames.occlude(name, form)
-
-    def displace(self, name: str, T_there_from_true: Array | None) -> None:
-        """Report a subject displaced by a transform ``[4, 4]`` in the world; None reports the truth again."""
-        with self._lock:
-            self._frames.displace(name, T_there_from_true)
-
-    def restart(self) -> None:
-        """Restart the frame numbers from 0, as Tracker does when it is restarted."""
-        with self._lock:
-            self._frames.frame_number = 0
-
     def close(self) -> None:
         """Stop sending."""
         self._stop.set()
@@ -179,9 +126,6 @@ class ViconEmulator:
     def _run(self) -> None:
         latency_ns = round(1e9 * self.config.latency_s)
         while (tick_ns := self._pacer.wait(self._stop)) is not None:
-            poses = self._poses(tick_ns - latency_ns)
-            with self._lock:
-                datagrams = self._frames.next(poses)
-            for datagram in datagrams:
+            for datagram in self._frames.next(self._poses(tick_ns - latency_ns)):
                 with contextlib.suppress(ConnectionRefusedError):  # there is no receiver yet
                     self._socket.sendto(datagram, (self.config.host, self.config.port))

@@ -21,7 +21,7 @@ import pytest
 
 from advnerf_core.geometry import make_transform, planar_pose
 from calibration.schema import VehicleCalibration, load_calibration
-from hardware.emulators.vicon_emulator import ViconEmulatorConfig, ViconFrames
+from hardware.emulators.vicon_emulator import ViconEmulatorConfig
 from hardware.mocap.vicon import SubjectTracker, ViconConfig
 from hardware.motor.limits import DriveLimiter
 from hardware.worlds.lab.config import CarConfig
@@ -35,6 +35,7 @@ from nodes.runtime.requests import RequestIdentity
 from nodes.safety import SafetyConfig, SafetyNode
 from nodes.vicon import ViconNode, ViconNodeConfig
 from tests.campaigns.campaign import Campaign
+from tests.support.faulty_devices import FaultyViconFrames
 from tests.support.live.processes import REPOSITORY
 
 CALIBRATION = REPOSITORY / "calibration" / "twin"
@@ -61,7 +62,7 @@ class SimulatedDrive:
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng([seed, 7])
-        self.frames = ViconFrames(MOCAP.model_copy(update={"seed": seed}))
+        self.frames = FaultyViconFrames(MOCAP.model_copy(update={"seed": seed}))
         calibration = load_calibration(VehicleCalibration, CALIBRATION / "vehicle.yaml")
         self._gains, self._limiter = calibration.vehicle_gains, DriveLimiter(calibration.drive_limits)
         self._tracker = SubjectTracker(ViconConfig(("car",)))

@@ -9,12 +9,13 @@ import pytest
 from advnerf_core.geometry import VehicleState, yaw_of
 from hardware.cameras.socket import SocketCamera
 from hardware.emulators.live import LiveLab, LiveLabConfig, PoseHistory
-from hardware.emulators.vicon_emulator import OCCLUSION_FORMS, ViconEmulatorConfig, ViconFrames
+from hardware.emulators.vicon_emulator import ViconEmulatorConfig
 from hardware.errors import HardwareError
 from hardware.mocap.vicon import SubjectTracker, ViconConfig, ViconReceiver
 from hardware.motor.limits import DriveLimits, VehicleGains
 from hardware.motor.vesc import Vesc
 from hardware.worlds.lab.lab import Lab
+from tests.support.faulty_devices import OCCLUSION_FORMS, FaultyLab, FaultyViconFrames
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
@@ -29,7 +30,7 @@ def receiver():
 @pytest.fixture(scope="module")
 def lab(receiver, tmp_path_factory):
     config = LiveLabConfig(vicon=ViconEmulatorConfig(port=receiver.port))
-    with LiveLab(config, tmp_path_factory.mktemp("run")) as lab:
+    with FaultyLab(config, tmp_path_factory.mktemp("run")) as lab:
         yield lab
 
 
@@ -56,7 +57,7 @@ def test_history_interpolates_over_the_cut_of_the_circle():
 
 @pytest.mark.parametrize("form", [None, *OCCLUSION_FORMS])
 def test_every_form_of_occlusion_is_recognised(form):
-    frames = ViconFrames(ViconEmulatorConfig())
+    frames = FaultyViconFrames(ViconEmulatorConfig())
     tracker = SubjectTracker(ViconConfig(subjects=("car",)))
     seen = []
     for k in range(60):

@@ -19,6 +19,7 @@ from hardware.motor.vesc_codec import CommandId, encode_command
 from hardware.motor.vesc_replies import FirmwareVersion
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
+from tests.support.faulty_devices import FaultyVescEmulator
 from tests.support.waiting import wait_for
 from tests.support.wire_log import read_wire_log
 
@@ -63,7 +64,7 @@ def running(emulator):
 
 
 def test_a_jam_has_no_effect_on_a_step_up_to_an_earlier_time():
-    with VescEmulator(VescEmulatorConfig(), vehicle()) as emulator:
+    with FaultyVescEmulator(VescEmulatorConfig()) as emulator:
         emulator.vehicle.command(erpm=4000.0)
         before_ns = time.monotonic_ns()
         emulator.advance(0.5, before_ns)
@@ -308,4 +309,4 @@ def test_firmware_survives_noise_between_commands():
     good = encode_command(CommandId.SET_CURRENT, 0.0)
     firmware.receive(b"\x02\x00\xff\x03" + good + b"\x55\x02" + good * 3, 0)
     assert plant.commands == [{"current_a": 0.0}] * 4
-    assert firmware.skipped_bytes == 6
+    assert firmware._decoder.skipped_bytes == 6

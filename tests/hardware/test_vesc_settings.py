@@ -93,7 +93,7 @@ def test_read_set_and_read_back_over_the_wire(link):
     vesc, emulator = link
     assert vesc.read_timeout() == TimeoutSettings(1000, 0.0)
     assert vesc.set_timeout(TimeoutSettings(250, 20.0)) == TimeoutSettings(250, 20.0)
-    assert emulator.timeout == TimeoutSettings(250, 20.0)
+    assert emulator.firmware.timeout == TimeoutSettings(250, 20.0)
 
 
 def test_a_turning_motor_keeps_its_settings(link):
@@ -101,7 +101,7 @@ def test_a_turning_motor_keeps_its_settings(link):
     emulator.vehicle.reset(0.0, 0.0, 0.0, speed_mps=1.0)
     with pytest.raises(ProtocolError, match="at rest"):
         vesc.set_timeout(TimeoutSettings(250, 20.0))
-    assert emulator.timeout == TimeoutSettings(1000, 0.0)
+    assert emulator.firmware.timeout == TimeoutSettings(1000, 0.0)
 
 
 def test_a_controller_that_does_not_tell_its_settings():
@@ -119,7 +119,7 @@ def test_a_configuration_of_another_firmware_is_refused(link):
     foreign = decode_app_configuration(payload((5, 2)), FirmwareVersion(5, 2))
     vesc._write(foreign.encode_set())
     vesc.read_values()
-    assert emulator.timeout == TimeoutSettings(1000, 0.0)
+    assert emulator.firmware.timeout == TimeoutSettings(1000, 0.0)
 
 
 def test_head_is_where_the_firmware_puts_it():

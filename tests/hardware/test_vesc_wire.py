@@ -5,16 +5,13 @@ import time
 
 import pytest
 
-from hardware.emulators.vesc_emulator import VescEmulator
 from hardware.emulators.vesc_firmware import VescEmulatorConfig
-from hardware.emulators.vesc_wire import wire_chunks
 from hardware.errors import LinkLost, LinkTimeout
 from hardware.motor.limits import DriveLimits, VehicleGains
 from hardware.motor.vesc import Vesc
 from hardware.motor.vesc_codec import FrameDecoder, encode_frame
 from hardware.motor.vesc_replies import FirmwareVersion, Values
-from hardware.worlds.lab.config import CarConfig
-from hardware.worlds.lab.vehicle import TwinVehicle
+from tests.support.faulty_devices import FaultyVescEmulator, wire_chunks
 
 pytestmark = pytest.mark.live
 
@@ -41,7 +38,7 @@ def connect(emulator):
 @pytest.mark.parametrize("fault", [None, "dribble", "noise"])
 def test_every_generation_gets_through(generation, firmware, fault):
     config = VescEmulatorConfig(generation=generation, firmware=firmware, hardware_name="60", supply_v=15.2)
-    with VescEmulator(config, TwinVehicle(CarConfig())) as emulator:
+    with FaultyVescEmulator(config) as emulator:
         emulator.disturb(fault)
         vesc = connect(emulator)
         version = vesc.identify(timeout_s=60.0)
@@ -54,7 +51,7 @@ def test_every_generation_gets_through(generation, firmware, fault):
 
 @pytest.mark.parametrize("fault", ["garbage", "bad_crc", "silent"])
 def test_nothing_wrong_is_taken_for_telemetry(fault):
-    with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as emulator:
+    with FaultyVescEmulator(VescEmulatorConfig()) as emulator:
         vesc = connect(emulator)
         vesc.identify()
         emulator.disturb(fault)
@@ -78,7 +75,7 @@ def _heard_again(vesc):
 
 def test_unplugged_and_plugged_in_again(tmp_path):
     link = tmp_path / "vesc"
-    with VescEmulator(VescEmulatorConfig(timeout_ms=100.0), TwinVehicle(CarConfig()), link) as emulator:
+    with FaultyVescEmulator(VescEmulatorConfig(timeout_ms=100.0), link=link) as emulator:
         vesc = Vesc(str(link), VehicleGains(), DriveLimits())
         vesc.open()
         vesc.drive(0.5, 0.0)
@@ -88,7 +85,7 @@ def test_unplugged_and_plugged_in_again(tmp_path):
             vesc.receive()
         vesc.abandon()
         emulator.advance(0.01, time.monotonic_ns() + 10**9)
-        assert emulator.timed_out  # the firmware lives on without the plug
+        assert emulator.firmware.timed_out  # the firmware lives on without the plug
         emulator.plug_in()
         emulator.plug_in()  # twice does no harm
         vesc.open()
@@ -98,7 +95,7 @@ def test_unplugged_and_plugged_in_again(tmp_path):
 
 def test_unknown_fault():
     with (
-        VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as emulator,
+        FaultyVescEmulator(VescEmulatorConfig()) as emulator,
         pytest.raises(ValueError, match=r"expected a fault of dribble.*got 'rust'"),
     ):
         emulator.disturb("rust")
@@ -126,7 +123,7 @@ def test_a_wrong_sum_costs_every_frame_of_a_reply():
 
 
 def test_replies_are_told_apart_by_what_they_are():
-    with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as emulator:
+    with FaultyVescEmulator(VescEmulatorConfig()) as emulator:
         vesc = connect(emulator)
         vesc.identify()
         vesc.request_values()

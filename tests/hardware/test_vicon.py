@@ -228,10 +228,11 @@ def test_a_bad_network_costs_poses_and_never_gives_a_wrong_or_an_old_one():
 
 @pytest.mark.parametrize("form", ["missing", "zeros", "nan", "frozen"])
 def test_an_occluded_subject_is_lost_and_the_other_is_not(form):
-    from hardware.emulators.vicon_emulator import ViconEmulatorConfig, ViconFrames
+    from hardware.emulators.vicon_emulator import ViconEmulatorConfig
+    from tests.support.faulty_devices import FaultyViconFrames
 
     emulator, feed, seen = (
-        ViconFrames(ViconEmulatorConfig()),
+        FaultyViconFrames(ViconEmulatorConfig()),
         Feed(ViconConfig(("car", "board"), frozen_frames=5)),
         [],
     )

@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from advnerf_core.geometry import planar_pose
-from hardware.emulators.vicon_emulator import ViconEmulator, ViconEmulatorConfig, ViconFrames
+from hardware.emulators.vicon_emulator import ViconEmulator, ViconEmulatorConfig
 from hardware.mocap.vicon import SubjectTracker, ViconConfig, ViconReceiver
 from hardware.mocap.vicon_codec import decode_block, encode_blocks, object_pose
+from tests.support.faulty_devices import FaultyViconFrames
 
 pytestmark = pytest.mark.live
 
@@ -131,7 +132,7 @@ def test_no_network_and_no_occlusion_looks_like_a_second_sender(
         seed=seed, loss=loss, duplication=duplication, reordering=reordering, shuffle=True, block_bytes=block
     )
     frames, tracker, mono_ns = (
-        ViconFrames(config),
+        FaultyViconFrames(config),
         SubjectTracker(ViconConfig(subjects=("car", "board"))),
         10**12,
     )

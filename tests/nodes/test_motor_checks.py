@@ -21,6 +21,7 @@ from nodes.runtime.clock import Now, SystemClock
 from nodes.runtime.messages import decode, encode, header, pose_message, types
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.twin_port import claim_twins_port, is_twin, is_twins_port
+from tests.support.faulty_devices import FaultyVescEmulator
 from tests.support.safety_reports import state_message
 from tests.support.waiting import wait_for
 
@@ -35,8 +36,8 @@ class Car:
 
     def __init__(self, tmp_path, config=None, twins_port=True, **vesc):
         self.claim = claim_twins_port(tmp_path) if twins_port else None
-        self.emulator = VescEmulator(
-            VescEmulatorConfig(**{"hardware_name": "60", **vesc}), TwinVehicle(CarConfig()), tmp_path / "vesc"
+        self.emulator = FaultyVescEmulator(
+            VescEmulatorConfig(**{"hardware_name": "60", **vesc}), link=tmp_path / "vesc"
         )
         config = MotorConfig(port=str(tmp_path / "vesc"), calibration=VEHICLE, **(config or {}))
         self.node = MotorNode.build(config, NodeContext("motor", tmp_path, CLOCK))
@@ -299,7 +300,7 @@ def test_command_line(tmp_path):
         )
         assert stored.exit_code == 0, stored.output
         assert "was 1000 ms with 0 A, is 250 ms with 20 A" in stored.output
-        assert str(emulator.timeout) == "250 ms with 20 A"
+        assert str(emulator.firmware.timeout) == "250 ms with 20 A"
     assert CliRunner().invoke(app, ["car", "motor", "set-timeout", "--timeout-ms", "0"]).exit_code == 2
 
 

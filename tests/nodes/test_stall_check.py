@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hardware.worlds.lab.config import CarConfig
-from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.control.stall_check import StallGate, StallLimits
+from tests.support.faulty_devices import JammableVehicle
 
 pytestmark = pytest.mark.live
 
@@ -28,7 +28,7 @@ def drive(seconds, command, jams=(), gate=None, dead_s=0.0, blind=(), seed=0):
         blind: From when to when motion capture sees nothing.
         seed: Of the noise.
     """
-    gate, car, rng = gate or StallGate(StallLimits()), TwinVehicle(CAR), np.random.default_rng(seed)
+    gate, car, rng = gate or StallGate(StallLimits()), JammableVehicle(CAR), np.random.default_rng(seed)
     for k in range(round(100 * seconds)):
         t = 0.01 * k
         mono_ns = 10**12 + k * 10_000_000

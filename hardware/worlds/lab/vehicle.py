@@ -13,14 +13,7 @@ from advnerf_core.geometry import VehicleState
 from hardware.worlds.footprints import Footprint, touched_by
 from hardware.worlds.lab.config import CarConfig
 
-JAMS = ("locked", "spinning")
 SUBSTEP_S = 0.004  # 3 mm at 0.8 m/s, and 1/15 of the fastest time constant
-
-
-def require_jam(how: str | None) -> None:
-    """Raise unless ``how`` is a known kind of jam."""
-    if how not in (None, *JAMS):
-        raise ValueError(f"expected a jam of {', '.join(JAMS)}, got {how!r}")
 
 
 class TwinVehicle:
@@ -48,7 +41,6 @@ class TwinVehicle:
         self.params = params
         self._obstacles = tuple(obstacles)
         self._room_half_m = room_half_m
-        self._jam: str | None = None
         self.reset(*start)
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float, speed_mps: float = 0.0) -> None:
@@ -100,11 +92,6 @@ class TwinVehicle:
         for name, value in given.items():
             self._mode, self._value = name, value
 
-    def jam(self, how: str | None) -> None:
-        """Hold the car in place, with its wheels ``locked`` or ``spinning`` on the spot; None releases it."""
-        require_jam(how)
-        self._jam = how
-
     def advance(self, dt_s: float) -> VehicleState:
         """Move on by ``dt_s`` seconds in equal substeps of at most ``SUBSTEP_S``, and return the new state."""
         if not (math.isfinite(dt_s) and dt_s >= 0.0):
@@ -151,10 +138,6 @@ class TwinVehicle:
         steering = self._steering + min(max(change, -limit), limit)
         speed = self._next_speed(dt_s)
         mean_speed = 0.5 * (self._speed + speed)
-        if self._jam is not None:
-            self._steering, self.blocked = steering, True
-            self._speed = speed if self._jam == "spinning" else 0.0
-            return
         turn = mean_speed * math.tan(0.5 * (self._steering + steering)) / p.wheelbase_m * dt_s
         # Chord of an exact arc: its direction is half-way through the turn.
         chord = mean_speed * dt_s * (math.sin(0.5 * turn) / (0.5 * turn) if abs(turn) > 1e-9 else 1.0)

@@ -15,7 +15,7 @@ import pytest
 
 from hardware.emulators.vesc_emulator import VescEmulator
 from hardware.emulators.vesc_firmware import VescEmulatorConfig
-from hardware.emulators.vicon_emulator import ViconEmulator, ViconEmulatorConfig
+from hardware.emulators.vicon_emulator import ViconEmulatorConfig
 from hardware.errors import LinkLost
 from hardware.mocap.vicon import ViconConfig
 from hardware.motor.vesc_settings import TimeoutSettings
@@ -23,6 +23,7 @@ from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.lab.doctor import mocap, motor
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, DoctorCheck, examine
+from tests.support.faulty_devices import FaultyVescEmulator, FaultyViconEmulator
 from tests.support.live.processes import free_udp_port
 
 TWIN = Path(__file__).parents[3] / "calibration" / "twin"
@@ -30,7 +31,7 @@ GOOD = {"timeout_ms": 250.0, "timeout_brake_current_a": 20.0}
 
 
 def vesc(config=None, fault=0, wire=None):
-    with VescEmulator(VescEmulatorConfig(**(config or GOOD)), TwinVehicle(CarConfig())) as emulator:
+    with FaultyVescEmulator(VescEmulatorConfig(**(config or GOOD))) as emulator:
         emulator.report_fault(fault)
         emulator.disturb(wire)
         found = motor.vesc(emulator.port)
@@ -141,7 +142,7 @@ def tracker(names=("car", "board"), sent=None):
             sent.append(ns)
         return {name: np.eye(4) + np.eye(4, k=3) for name in names}
 
-    emulator = ViconEmulator(ViconEmulatorConfig(port=free_udp_port()), poses)
+    emulator = FaultyViconEmulator(ViconEmulatorConfig(port=free_udp_port()), poses)
     try:
         yield emulator
     finally:

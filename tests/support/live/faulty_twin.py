@@ -12,27 +12,28 @@ import threading
 import numpy as np
 
 from advnerf_core.geometry import Array, make_transform
-from hardware.emulators.live import LiveLab, LiveLabConfig
+from hardware.emulators.live import LiveLabConfig
 from hardware.emulators.vicon_emulator import ViconEmulator
 from nodes.runtime.node import NodeContext
 from nodes.runtime.paths import bus_folder
 from nodes.runtime.process import run_node_main
 from nodes.runtime.twin_port import claim_twins_port
 from nodes.twin import TwinNode
+from tests.support.faulty_devices import FaultyLab
 
 # To the side, and inside the fence of the track's straights: the pose check must stop the car, not the fence.
 _ELSEWHERE = make_transform(np.eye(3), [0.0, 0.1, 0.0])
 _JAMS = {"jammed": "locked", "spinning": "spinning"}
 
 
-class FaultyLab:
+class LabOnAString:
     """Obeys the commands.
 
     Args:
         lab: The lab.
     """
 
-    def __init__(self, lab: LiveLab) -> None:
+    def __init__(self, lab: FaultyLab) -> None:
         self._lab = lab
         self._second: ViconEmulator | None = None
 
@@ -71,7 +72,7 @@ class FaultyLab:
         return {"car": _ELSEWHERE @ np.asarray(self._lab.state.T_world_from_car)}
 
 
-def _listen(lab: FaultyLab) -> None:
+def _listen(lab: LabOnAString) -> None:
     for line in sys.stdin:
         lab.obey(line)
         print("ok", flush=True)
@@ -80,8 +81,8 @@ def _listen(lab: FaultyLab) -> None:
 def build(config: LiveLabConfig, context: NodeContext) -> TwinNode:
     """The twin node, with a thread that obeys standard input."""
     claim = claim_twins_port(context.run_dir)
-    lab = LiveLab(config, context.run_dir, bus_folder(context.run_dir))
-    threading.Thread(target=_listen, args=(FaultyLab(lab),), daemon=True).start()
+    lab = FaultyLab(config, context.run_dir, bus_folder(context.run_dir))
+    threading.Thread(target=_listen, args=(LabOnAString(lab),), daemon=True).start()
     return TwinNode(lab, claim)
 
 
