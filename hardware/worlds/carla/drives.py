@@ -1,14 +1,12 @@
-"""The drives through a junction of a CARLA map, and the same as plain data for use without a server."""
+"""The drives through a junction of a CARLA map, and the same as plain data."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hardware.worlds.carla.errors import CarlaMapError
 from hardware.worlds.carla.frames import SceneFrame
-from hardware.worlds.junction.paths import EXIT_OF, PathName
+from hardware.worlds.junction.paths import PathName
 from hardware.worlds.paths import ReferencePath
 
 
@@ -47,26 +45,6 @@ class JunctionDrives:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data (JSON types) from which :meth:`from_dict` rebuilds the drives without a server."""
+        """The drives as plain data (JSON types)."""
         paths = {name: path.to_dict() for name, path in self.paths.items()}
         return {**self.place, "paths": paths, "lane_width_m": self.lane_width_m}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> JunctionDrives:
-        """Rebuild drives from :meth:`to_dict`.
-
-        Raises:
-            CarlaMapError: The data does not describe drives.
-        """
-        try:
-            paths: dict[PathName, ReferencePath] = {
-                name: ReferencePath.from_dict(data["paths"][name]) for name in EXIT_OF
-            }
-            rest = {
-                name: data[name] for name in ("junction_id", "lane_width_m", "height_range_m", "right_hand")
-            }
-            return cls(frame=SceneFrame(**data["frame"]), paths=paths, **rest)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise CarlaMapError(
-                f"expected drives as written by JunctionDrives.to_dict, got something else: {error!r}"
-            ) from error

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.geometry import Array, wrap_angle
+from hardware.worlds.carla.config import JunctionConfig
 from hardware.worlds.carla.drives import JunctionDrives
 from hardware.worlds.carla.errors import CarlaMapError
 from hardware.worlds.carla.frames import CarlaPose, SceneFrame
@@ -88,39 +89,24 @@ def _arms(crossings: Sequence[Crossing]) -> int:
     return len(headings)
 
 
-def find_drives(
-    carla_map: Any,
-    library: Any,
-    junction_id: int | None = None,
-    choice: int = 0,
-    approach_m: float = 24.0,
-    beyond_m: float = 40.0,
-    max_height_range_m: float = math.inf,
-    tolerance_m: float = 0.02,
-) -> JunctionDrives:
-    """The drives through one junction.
+def find_drives(carla_map: Any, library: Any, wanted: JunctionConfig) -> JunctionDrives:
+    """The drives through one junction, on ground that is flat enough for a car that moves in a plane.
 
     Args:
         carla_map: A ``carla.Map``.
         library: The ``carla`` module.
-        junction_id: OpenDRIVE id; None selects the first junction of three roads that has such drives.
-        choice: Index among the junction's sets of drives, ordered by the heading of the straight one; a crossing of four roads has four.
-        approach_m: Distance of the drives' starts from the junction's middle, along the road [m].
-        beyond_m: Length of the road after the junction that belongs to the paths [m].
-        max_height_range_m: Largest height difference along the drives [m].
-        tolerance_m: Largest distance of the lines and arcs from the lanes [m].
 
     Raises:
         CarlaMapError: The map has no such junction, or its roads are too short or not flat enough.
     """
-    candidates, reasons = _candidates(carla_map, library, junction_id), []
+    candidates, reasons = _candidates(carla_map, library, wanted.id), []
     for junction in candidates:
         try:
-            drives = _drives_at(junction, library, choice, approach_m, beyond_m, tolerance_m)
-            if drives.height_range_m <= max_height_range_m:
+            drives = _drives_at(junction, library, wanted)
+            if drives.height_range_m <= wanted.max_height_range_m:
                 return drives
             reasons.append(
-                f"expected a flat junction, heights within {max_height_range_m:g} m, got {drives.height_range_m:.2f} m at junction "
+                f"expected a flat junction, heights within {wanted.max_height_range_m:g} m, got {drives.height_range_m:.2f} m at junction "
                 f"{drives.junction_id}; take another one (`advnerf scene carla junctions`), or shorter roads"
             )
         except CarlaMapError as error:
@@ -129,24 +115,20 @@ def find_drives(
     raise CarlaMapError(reasons[0] + more)
 
 
-def _drives_at(
-    junction: Any, library: Any, choice: int, approach_m: float, beyond_m: float, tolerance_m: float
-) -> JunctionDrives:
+def _drives_at(junction: Any, library: Any, wanted: JunctionConfig) -> JunctionDrives:
     sets = _sets_of_three(_crossings(junction, library))
-    if not 0 <= choice < len(sets):
+    if wanted.choice >= len(sets):
         raise CarlaMapError(
-            f"expected one of the {len(sets)} sets of drives of junction {junction.id} (0 to {len(sets) - 1}), got {choice}"
+            f"expected one of the {len(sets)} sets of drives of junction {junction.id} (0 to {len(sets) - 1}), got {wanted.choice}"
         )
-    three = sets[choice]
+    three = sets[wanted.choice]
     frame, waypoints = _frame_of(three), {}
     for name, crossing in three.items():
-        waypoints[name] = _along(
-            crossing, frame, approach_m, beyond_m, f"the drive {name} of junction {junction.id}"
-        )
+        waypoints[name] = _along(crossing, frame, wanted, f"the drive {name} of junction {junction.id}")
     heights = np.array([point.transform.location.z for points in waypoints.values() for point in points])
     x, y = (float(value) for value in frame.T_mirrored_from_world[:2, 3])
     frame = SceneFrame(x, y, float(np.median(heights)), frame.yaw_rad)
-    paths = {name: _path(name, points, frame, tolerance_m) for name, points in waypoints.items()}
+    paths = {name: _path(name, points, frame) for name, points in waypoints.items()}
     width = min(point.lane_width for points in waypoints.values() for point in points)
     return JunctionDrives(
         junction.id, frame, paths, float(width), float(np.ptp(heights)), bool(three["straight"].begin.is_rht)
@@ -229,9 +211,10 @@ def _frame_of(three: dict[PathName, Crossing]) -> SceneFrame:
     return SceneFrame(float(origin[0]), float(origin[1]), 0.0, yaw)
 
 
-def _along(crossing: Crossing, frame: SceneFrame, approach_m: float, beyond_m: float, what: str) -> list[Any]:
+def _along(crossing: Crossing, frame: SceneFrame, wanted: JunctionConfig, what: str) -> list[Any]:
     """Waypoints from the start of a drive, through the junction, to its end."""
     to_middle = float((frame.T_mirrored_from_world[:2, 3] - crossing.entry[:2]) @ _heading(crossing.entry))
+    approach_m = wanted.approach_m
     if approach_m < to_middle:
         raise CarlaMapError(
             f"expected {what} to start before it, at least {to_middle:.1f} m from its middle, got approach_m = {approach_m:.1f} m"
@@ -242,7 +225,7 @@ def _along(crossing: Crossing, frame: SceneFrame, approach_m: float, beyond_m: f
         for point in crossing.begin.next_until_lane_end(_SAMPLE_M)
         if _distance_m(point, crossing.end) > 0.3
     ]
-    after = _walk(crossing.end, beyond_m, backwards=False, what=what)
+    after = _walk(crossing.end, wanted.beyond_m, backwards=False, what=what)
     return [*reversed(before), crossing.begin, *inside, crossing.end, *after]
 
 
@@ -266,14 +249,14 @@ def _walk(start: Any, length_m: float, backwards: bool, what: str) -> list[Any]:
     return points
 
 
-def _path(name: PathName, waypoints: Sequence[Any], frame: SceneFrame, tolerance_m: float) -> ReferencePath:
+def _path(name: PathName, waypoints: Sequence[Any], frame: SceneFrame) -> ReferencePath:
     poses = []
     for waypoint in waypoints:
         T = frame.world_from_body(CarlaPose.of(waypoint.transform))
         poses.append((T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])))
     start = (float(poses[0][0]), float(poses[0][1]), float(poses[0][2]))
     try:
-        segments = fit_lines_and_arcs(poses, tolerance_m)
+        segments = fit_lines_and_arcs(poses)
     except ValueError as error:
         raise CarlaMapError(
             f"the lanes of the drive {name} do not join: {error}; take another junction"

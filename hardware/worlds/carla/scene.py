@@ -104,7 +104,7 @@ class CarlaScene:
         self._client = connect(config.server, library)
         self._world = open_world(self._client, config.server)
         check_nobody_else(self._world, config.server)
-        self._drives = drives_in(self._world.get_map(), library, config)
+        self._drives = find_drives(self._world.get_map(), library, config.junction)
         self._ticked = TickedWorld(
             self._world, config.render.fixed_delta_s, config.server.timeout_s, self._undo
         )
@@ -328,13 +328,3 @@ class CarlaScene:
 
     def _picture(self, camera: CarlaCamera) -> Any:
         return camera.picture(self._ticked.frame, self.config.server.frame_timeout_s)
-
-
-def drives_in(carla_map: Any, library: Any, config: CarlaConfig) -> JunctionDrives:
-    """The drives of the configured junction, on ground that is flat enough for a car that moves in a plane.
-
-    Raises:
-        CarlaMapError: The map has no such junction, or its roads are too short or not flat.
-    """
-    j = config.junction
-    return find_drives(carla_map, library, j.id, j.choice, j.approach_m, j.beyond_m, j.max_height_range_m)

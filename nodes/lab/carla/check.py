@@ -17,8 +17,9 @@ from hardware.worlds.carla.camera import DEPTH, RGB, camera_blueprint
 from hardware.worlds.carla.config import CarlaConfig
 from hardware.worlds.carla.connection import check_nobody_else, connect, map_name
 from hardware.worlds.carla.errors import CarlaError, CarlaFrameError, CarlaMapError
+from hardware.worlds.carla.junction import find_drives
 from hardware.worlds.carla.library import load_carla, server_answers
-from hardware.worlds.carla.scene import CarlaScene, drives_in
+from hardware.worlds.carla.scene import CarlaScene
 from hardware.worlds.world import require_depth
 from nodes.runtime.findings import CheckFinding
 
@@ -89,7 +90,7 @@ def _look_at_map(config: CarlaConfig, client: Any, world: Any) -> CheckFinding:
 
 
 def _look_at_junction(config: CarlaConfig, world: Any, library: Any) -> CheckFinding:
-    drives = drives_in(world.get_map(), library, config)
+    drives = find_drives(world.get_map(), library, config.junction)
     lengths = ", ".join(f"{name} {path.length_m:.1f} m" for name, path in drives.paths.items())
     side = "right" if drives.right_hand else "left"
     text = (

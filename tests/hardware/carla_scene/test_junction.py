@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 
 from advnerf_core.driving.path import Arc, Line, Path
+from hardware.worlds.carla.config import JunctionConfig
 from hardware.worlds.carla.errors import CarlaMapError
 from hardware.worlds.carla.junction import find_drives, list_junctions
 from hardware.worlds.junction.paths import junction_paths
 
 
 def drives_of(carla, junction, **settings):
-    return find_drives(carla.Map("written", junction.text()), carla, **settings)
+    return find_drives(carla.Map("written", junction.text()), carla, wanted(**settings))
+
+
+def wanted(**settings):
+    return JunctionConfig(**{"max_height_range_m": 100.0, **settings})
 
 
 def path_of(reference):
@@ -80,7 +85,7 @@ def test_a_slope_shows_in_the_height_range(carla, TJunction):
 
 def test_what_a_map_lacks_is_said(carla, TJunction):
     with pytest.raises(CarlaMapError, match=r"junction 7 in the map written, which has \[100\]"):
-        drives_of(carla, TJunction(), junction_id=7)
+        drives_of(carla, TJunction(), id=7)
     with pytest.raises(CarlaMapError, match=r"one of the 1 sets of drives of junction 100 \(0 to 0\), got 1"):
         drives_of(carla, TJunction(), choice=1)
     with pytest.raises(CarlaMapError, match=r"expected 85.0 m of road before the junction .* found 20.0 m"):
@@ -96,16 +101,16 @@ def test_what_a_map_lacks_is_said(carla, TJunction):
         .replace('<successor elementType="junction" elementId="100"/>', "")
     )
     with pytest.raises(CarlaMapError, match="junction of three roads in the map road, found none"):
-        find_drives(carla.Map("road", only_a_road + "</OpenDRIVE>"), carla)
+        find_drives(carla.Map("road", only_a_road + "</OpenDRIVE>"), carla, wanted())
 
 
 def test_of_several_junctions_the_first_that_will_do_is_taken(carla, TJunction):
     """One file with a hill's junction (100) and a flat one (200) beside it."""
     both = carla.Map("both", TJunction(slope=0.05).text(TJunction(y_m=-400.0, first_id=100)))
     assert [info.id for info in list_junctions(both, carla)] == [100, 200]
-    assert find_drives(both, carla).junction_id == 100
-    drives = find_drives(both, carla, max_height_range_m=0.15)
+    assert find_drives(both, carla, wanted()).junction_id == 100
+    drives = find_drives(both, carla, wanted(max_height_range_m=0.15))
     assert drives.junction_id == 200
     assert drives.paths["left"].start_pose == pytest.approx((1.75, -24.0, math.pi / 2), abs=1e-3)
     with pytest.raises(CarlaMapError, match=r"none of 2 junctions will do; this is the first"):
-        find_drives(both, carla, max_height_range_m=0.15, beyond_m=300.0)
+        find_drives(both, carla, wanted(max_height_range_m=0.15, beyond_m=300.0))

@@ -7,11 +7,12 @@ import pytest
 
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import transform_points
-from hardware.worlds.carla import CarlaConfig, CarlaUnreachable
-from hardware.worlds.carla.drives import JunctionDrives
-from hardware.worlds.carla.errors import CarlaMapError
+from hardware.worlds.carla import CarlaConfig, CarlaScene, CarlaUnreachable
+from hardware.worlds.carla.config import JunctionConfig
+from hardware.worlds.carla.frames import SceneFrame
 from hardware.worlds.carla.junction import find_drives
 from hardware.worlds.carla.photos import photo_poses
+from hardware.worlds.paths import ReferencePath
 from nodes.lab.carla.capture import CaptureRequest, capture
 from nodes.runtime.errors import ConfigError
 
@@ -30,7 +31,7 @@ def run(library, settings, folder, request=REQUEST, **changes):
 
 def test_images_and_poses_belong_together(library, settings, tmp_path):
     assert run(library, settings, tmp_path / "set") == (15, 0)
-    drives = JunctionDrives.from_dict(json.loads((tmp_path / "set" / "drives.json").read_text()))
+    frame = SceneFrame(**json.loads((tmp_path / "set" / "drives.json").read_text())["frame"])
     for name, count, size in (("photos", 12, (64, 36)), ("held_out", 3, (84, 46))):
         views = load_transforms(tmp_path / "set" / name, require_all=True).load()
         assert len(views.rgb) == count
@@ -41,14 +42,14 @@ def test_images_and_poses_belong_together(library, settings, tmp_path):
             t = np.where(down > 0.03, T[2, 3] / np.maximum(down, 0.03), np.inf)
             near = t < 30.0
             points = transform_points(T, d * np.where(near, t, 0.0)[..., None])
-            mirrored = transform_points(drives.frame.T_mirrored_from_world, points) * [1.0, -1.0, 1.0]
+            mirrored = transform_points(frame.T_mirrored_from_world, points) * [1.0, -1.0, 1.0]
             # JPEG at 95 % blurs colours a little; a pose that is wrong by a metre is wrong by two counts everywhere.
             error = np.abs(library.world.colour(mirrored)[..., :2] - rgb[..., :2].astype(float))[near]
             assert np.median(error) <= (2.0 if name == "photos" else 1.0)
 
 
 def test_photographs_are_along_the_lanes_and_above(carla, TJunction):
-    drives = find_drives(carla.Map("written", TJunction().text()), carla)
+    drives = find_drives(carla.Map("written", TJunction().text()), carla, JunctionConfig())
     T = np.array(photo_poses(drives, CarlaConfig(), 300, np.random.default_rng(1)))
     raised = T[:, 2, 3] > 2.5
     assert raised.sum() == 60
@@ -97,12 +98,9 @@ def test_another_capture_is_not_mixed_in(library, settings, tmp_path):
         run(library, settings, tmp_path / "other")
 
 
-def test_drives_come_back_from_plain_data(library, settings, tmp_path):
+def test_drives_are_written_as_plain_data(library, settings, tmp_path):
     run(library, settings, tmp_path / "set", CaptureRequest(photos=1, held_out=0))
     data = json.loads((tmp_path / "set" / "drives.json").read_text())
-    drives = JunctionDrives.from_dict(data)
-    assert json.loads(json.dumps(drives.to_dict())) == data
-    assert drives.paths["left"].goal == (0.0, 0.0, 1.0)
-    for wrong in ({}, {**data, "paths": {"up": data["paths"]["left"]}}, {**data, "frame": {}}, []):
-        with pytest.raises(CarlaMapError, match="expected drives as written"):
-            JunctionDrives.from_dict(wrong)
+    with CarlaScene(CarlaConfig.model_validate(settings), library) as scene:
+        assert json.loads(json.dumps(scene.drives.to_dict())) == data
+    assert ReferencePath.from_dict(data["paths"]["left"]).goal == (0.0, 0.0, 1.0)
