@@ -38,131 +38,99 @@ def save_with_plot(calibration: Calibration, path: Path, draw: Callable[[Figure]
     return picture
 
 
-def intrinsics_plot(fit: IntrinsicsFit) -> Callable[[Figure], None]:
+def intrinsics_plot(figure: Figure, fit: IntrinsicsFit) -> None:
     """Coverage map and reprojection errors."""
-
-    def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2)
-        size = (fit.calibration.width, fit.calibration.height)
-        shown = left.imshow(fit.coverage, extent=(0, size[0], size[1], 0), cmap="viridis", aspect="equal")
-        figure.colorbar(shown, ax=left, label="corners per cell")
-        left.set(title="coverage", xlabel="column [px]", ylabel="row [px]")
-        right.plot(fit.errors_px[:, 0], fit.errors_px[:, 1], ".", markersize=2, alpha=0.5)
-        _square(
-            right, "reprojection error", "column [px]", "row [px]", f"rms {fit.calibration.rms_px:.3f} px"
-        )
-
-    return draw
+    left, right = figure.subplots(1, 2)
+    size = (fit.calibration.width, fit.calibration.height)
+    shown = left.imshow(fit.coverage, extent=(0, size[0], size[1], 0), cmap="viridis", aspect="equal")
+    figure.colorbar(shown, ax=left, label="corners per cell")
+    left.set(title="coverage", xlabel="column [px]", ylabel="row [px]")
+    right.plot(fit.errors_px[:, 0], fit.errors_px[:, 1], ".", markersize=2, alpha=0.5)
+    _square(right, "reprojection error", "column [px]", "row [px]", f"rms {fit.calibration.rms_px:.3f} px")
 
 
-def mount_plot(fit: MountFit) -> Callable[[Figure], None]:
+def mount_plot(figure: Figure, fit: MountFit) -> None:
     """Reprojection error of each view, left-out views marked."""
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        index, rms = np.arange(len(fit.view_rms_px)), fit.view_rms_px
-        axes.bar(index[fit.used], rms[fit.used], label="fitted")
-        if not fit.used.all():
-            axes.bar(index[~fit.used], np.nan_to_num(rms[~fit.used]), color="tab:red", label="left out")
-        degrees, mm = np.degrees(fit.rotation_stddev_rad), 1000.0 * fit.translation_stddev_m
-        axes.set(
-            title=f"{fit.method}\nstandard deviation {degrees:.3f} degrees, {mm:.2f} mm",
-            xlabel="view",
-            ylabel="reprojection error [px]",
-        )
-        axes.legend()
-
-    return draw
+    axes = figure.subplots()
+    index, rms = np.arange(len(fit.view_rms_px)), fit.view_rms_px
+    axes.bar(index[fit.used], rms[fit.used], label="fitted")
+    if not fit.used.all():
+        axes.bar(index[~fit.used], np.nan_to_num(rms[~fit.used]), color="tab:red", label="left out")
+    degrees, mm = np.degrees(fit.rotation_stddev_rad), 1000.0 * fit.translation_stddev_m
+    axes.set(
+        title=f"{fit.method}\nstandard deviation {degrees:.3f} degrees, {mm:.2f} mm",
+        xlabel="view",
+        ylabel="reprojection error [px]",
+    )
+    axes.legend()
 
 
-def scene_plot(fit: SceneFit) -> Callable[[Figure], None]:
+def scene_plot(figure: Figure, fit: SceneFit) -> None:
     """Cameras in both worlds from above, and the errors of left-out ones."""
-
-    def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2)
-        inside = fit.alignment.inliers
-        left.plot(
-            fit.T_world_from_camera[:, 0, 3], fit.T_world_from_camera[:, 1, 3], "k+", label="motion capture"
-        )
-        left.plot(fit.placed[inside, 0, 3], fit.placed[inside, 1, 3], ".", label="scene, placed")
-        left.plot(fit.placed[~inside, 0, 3], fit.placed[~inside, 1, 3], "r.", label="outliers")
-        left.set(title="cameras from above", xlabel="x [m]", ylabel="y [m]", aspect="equal")
-        left.legend()
-        right.hist(1000.0 * fit.held_out_m, bins=20)
-        right.set(
-            title="cameras that were left out", xlabel="distance from motion capture [mm]", ylabel="cameras"
-        )
-
-    return draw
+    left, right = figure.subplots(1, 2)
+    inside = fit.alignment.inliers
+    left.plot(
+        fit.T_world_from_camera[:, 0, 3], fit.T_world_from_camera[:, 1, 3], "k+", label="motion capture"
+    )
+    left.plot(fit.placed[inside, 0, 3], fit.placed[inside, 1, 3], ".", label="scene, placed")
+    left.plot(fit.placed[~inside, 0, 3], fit.placed[~inside, 1, 3], "r.", label="outliers")
+    left.set(title="cameras from above", xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    left.legend()
+    right.hist(1000.0 * fit.held_out_m, bins=20)
+    right.set(
+        title="cameras that were left out", xlabel="distance from motion capture [mm]", ylabel="cameras"
+    )
 
 
-def vehicle_plot(gains: GainsFit, response: ResponseFit) -> Callable[[Figure], None]:
+def vehicle_plot(figure: Figure, gains: GainsFit, response: ResponseFit) -> None:
     """Both lines, and ten seconds of the yaw."""
-
-    def draw(figure: Figure) -> None:
-        one, two, three = figure.subplots(1, 3)
-        servo, erpm = (np.array([getattr(s, name) for s in gains.segments]) for name in ("servo", "erpm"))
-        _line(one, servo, gains.steering_rad, gains.steering_of, "servo", "wheel angle [rad]")
-        _line(two, erpm, gains.speed_mps, gains.speed_of, "erpm", "speed [m/s]")
-        last = response.steering.time_s > response.steering.time_s[-1] - 10.0
-        three.plot(
-            response.steering.time_s[last], response.steering.seen[last], "k", linewidth=0.8, label="seen"
-        )
-        three.plot(
-            response.steering.time_s[last], response.steering.modelled[last], "tab:orange", label="model"
-        )
-        s = response.steering
-        three.set(
-            title=f"delay {1000 * s.delay_s:.0f} ms, lag {1000 * s.lag_s:.0f} ms",
-            xlabel="time [s]",
-            ylabel="turn in 60 ms [rad]",
-        )
-        three.legend()
-
-    return draw
+    one, two, three = figure.subplots(1, 3)
+    servo, erpm = (np.array([getattr(s, name) for s in gains.segments]) for name in ("servo", "erpm"))
+    _line(one, servo, gains.steering_rad, gains.steering_of, "servo", "wheel angle [rad]")
+    _line(two, erpm, gains.speed_mps, gains.speed_of, "erpm", "speed [m/s]")
+    last = response.steering.time_s > response.steering.time_s[-1] - 10.0
+    three.plot(response.steering.time_s[last], response.steering.seen[last], "k", linewidth=0.8, label="seen")
+    three.plot(response.steering.time_s[last], response.steering.modelled[last], "tab:orange", label="model")
+    s = response.steering
+    three.set(
+        title=f"delay {1000 * s.delay_s:.0f} ms, lag {1000 * s.lag_s:.0f} ms",
+        xlabel="time [s]",
+        ylabel="turn in 60 ms [rad]",
+    )
+    three.legend()
 
 
-def display_plot(fit: DisplayFit) -> Callable[[Figure], None]:
+def display_plot(figure: Figure, fit: DisplayFit) -> None:
     """Curves, and predicted against seen colours."""
-
-    def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2)
-        levels = np.linspace(0.0, 1.0, fit.model.curves.shape[1])
-        predicted = fit.model.forward(fit.shown, fit.cos_angle)
-        for channel, colour in enumerate(_CHANNELS):
-            left.plot(levels, fit.model.curves[channel], color=colour)
-            for rows, marker in ((~fit.held_out, "."), (fit.held_out, "x")):
-                right.plot(
-                    fit.seen[rows, channel], predicted[rows, channel], marker, color=colour, markersize=4
-                )
-        left.set(title="light of the monitor's channels", xlabel="shown", ylabel="light")
-        right.plot([0, 1], [0, 1], "k", linewidth=0.6)
-        _square(right, f"held out (x): rmse {100 * fit.rmse(True):.2f} %", "seen", "predicted")
-
-    return draw
+    left, right = figure.subplots(1, 2)
+    levels = np.linspace(0.0, 1.0, fit.model.curves.shape[1])
+    predicted = fit.model.forward(fit.shown, fit.cos_angle)
+    for channel, colour in enumerate(_CHANNELS):
+        left.plot(levels, fit.model.curves[channel], color=colour)
+        for rows, marker in ((~fit.held_out, "."), (fit.held_out, "x")):
+            right.plot(fit.seen[rows, channel], predicted[rows, channel], marker, color=colour, markersize=4)
+    left.set(title="light of the monitor's channels", xlabel="shown", ylabel="light")
+    right.plot([0, 1], [0, 1], "k", linewidth=0.6)
+    _square(right, f"held out (x): rmse {100 * fit.rmse(True):.2f} %", "seen", "predicted")
 
 
-def offset_plot(fit: OffsetFit) -> Callable[[Figure], None]:
+def offset_plot(figure: Figure, fit: OffsetFit) -> None:
     """Correlation over the shift, and both turns at the offset."""
-
-    def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2)
-        left.plot(1000.0 * fit.shifts_s, fit.correlation)
-        left.axvline(1000.0 * fit.camera_minus_mocap_s, color="tab:orange")
-        ms, sd = 1000.0 * fit.camera_minus_mocap_s, 1000.0 * fit.stddev_s
-        left.set(title=f"camera {ms:.1f} +- {sd:.1f} ms behind", xlabel="shift [ms]", ylabel="correlation")
-        right.plot(fit.turns.end_s, fit.turns.yaw_rad, "k.", markersize=3, label="image")
-        right.plot(
-            fit.turns.end_s,
-            fit.car_yaw_rad,
-            color="tab:orange",
-            linewidth=0.8,
-            label="motion capture at the offset",
-        )
-        right.set(xlabel="time [s]", ylabel="turn between frames [rad]")
-        right.legend()
-
-    return draw
+    left, right = figure.subplots(1, 2)
+    left.plot(1000.0 * fit.shifts_s, fit.correlation)
+    left.axvline(1000.0 * fit.camera_minus_mocap_s, color="tab:orange")
+    ms, sd = 1000.0 * fit.camera_minus_mocap_s, 1000.0 * fit.stddev_s
+    left.set(title=f"camera {ms:.1f} +- {sd:.1f} ms behind", xlabel="shift [ms]", ylabel="correlation")
+    right.plot(fit.turns.end_s, fit.turns.yaw_rad, "k.", markersize=3, label="image")
+    right.plot(
+        fit.turns.end_s,
+        fit.car_yaw_rad,
+        color="tab:orange",
+        linewidth=0.8,
+        label="motion capture at the offset",
+    )
+    right.set(xlabel="time [s]", ylabel="turn between frames [rad]")
+    right.legend()
 
 
 def _line(axes: Any, x: Any, y: Any, of: Callable[[Any], Any], x_name: str, y_name: str) -> None:

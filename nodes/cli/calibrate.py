@@ -134,7 +134,7 @@ def intrinsics(
     step = max(1, -(-len(views) // most))
     print(f"board found in {len(views)} of {-(-seen // every)} images")
     fit = calibrate_intrinsics(views[::step], size, model)  # type: ignore[arg-type]
-    save_and_print(fit.calibration, output, intrinsics_plot(fit))
+    save_and_print(fit.calibration, output, lambda figure: intrinsics_plot(figure, fit))
 
 
 @app.command("camera-to-car")
@@ -178,7 +178,7 @@ def camera_to_car(
     views, frames = still_views(bag, detector, tracked)
     print(f"{len(views)} stops with the board in view among {frames} frames")
     fit = calibrate_mount(views, camera, None if pattern is None else _transform(pattern))
-    save_and_print(fit.calibration(camera), output, mount_plot(fit))
+    save_and_print(fit.calibration(camera), output, lambda figure: mount_plot(figure, fit))
 
 
 @app.command("mocap-to-scene")
@@ -208,7 +208,7 @@ def mocap_to_scene(
         for file in (scene, mocap)
     )
     fit = place_scene(one, two)
-    save_and_print(fit.calibration, output, scene_plot(fit))
+    save_and_print(fit.calibration, output, lambda figure: scene_plot(figure, fit))
 
 
 @app.command("vehicle")
@@ -236,7 +236,7 @@ def vehicle(
     gains = fit_gains(drive, wheelbase_m or old.wheelbase_m)
     response = fit_response(drive, gains)
     new = vehicle_calibration(gains, response, old)
-    save_and_print(new, output, vehicle_plot(gains, response))
+    save_and_print(new, output, lambda figure: vehicle_plot(figure, gains, response))
     g, ahead = new.gains, 1000.0 * gains.origin_ahead_m
     print(
         f"servo {g.servo_per_rad:.4f} per rad, offset {g.servo_offset:.4f}; {g.erpm_per_mps:.1f} erpm per m/s"
@@ -276,7 +276,7 @@ def time_offset(
     turns = image_turns((((stamp - start) / 1e9, image) for stamp, image in read_frames(bag)), known)
     yaw = np.unwrap(np.arctan2(poses.T[:, 1, 0], poses.T[:, 0, 0]))
     fit = fit_offset(turns, (poses.stamps_ns - start) / 1e9, yaw)
-    save_and_print(fit.calibration, output, offset_plot(fit))
+    save_and_print(fit.calibration, output, lambda figure: offset_plot(figure, fit))
     offset = fit.calibration.camera_minus_mocap_s
     # The camera node already subtracted its current latency_s from the stamps in the bag.
     total = known.latency_s + offset

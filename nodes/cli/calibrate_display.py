@@ -77,7 +77,7 @@ def display(
     if screen is not None or twin is not None:
         _show_colours(folder, screen, twin, run_dir)
     fit = fit_display(*read_shown(folder))
-    save_and_print(fit.calibration(conditions), output, display_plot(fit))
+    save_and_print(fit.calibration(conditions), output, lambda figure: display_plot(figure, fit))
 
 
 def _show_colours(folder: Path, screen: int | None, twin: Path | None, run_dir: Path | None) -> None:
