@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from advnerf_core.attack.printing.frame import CELLS
 from advnerf_core.attack.printing.poster import MM_PER_M, Printable
 from advnerf_core.geometry import Array, transform_points
+from advnerf_core.plain import PlainData
 from advnerf_core.scene.colour import fit_colour_map
 from calibration.degeneracy import DegenerateDataError
 from calibration.print_markers import linear
@@ -175,6 +176,25 @@ def patch_colours(
 
 
 @dataclass(frozen=True, eq=False)
+class ColourError(PlainData):
+    """Difference of a print to its nominal texture, of sRGB colours in 0..255 in even white light.
+
+    Attributes:
+        rms: Root mean square, in light in which ink is black too.
+        mean: Mean of each channel.
+        far_share: Share of the picture that is off by more than a quarter of full scale, such as covered parts.
+        seen_share: Share of the print that the photograph shows.
+        uneven: Change of the light over the print, as a share of its mean.
+    """
+
+    rms: float
+    mean: tuple[float, float, float]
+    far_share: float
+    seen_share: float
+    uneven: float
+
+
+@dataclass(frozen=True, eq=False)
 class PrintColours:
     """A print with its border, as photographed. Parts that the photograph does not show have the nominal colours, changed like the others.
 
@@ -182,21 +202,13 @@ class PrintColours:
         nominal: Printed colours ``[n, n, 3]`` uint8.
         seen: Colours in the camera ``[n, n, 3]`` uint8.
         unlit: Colours in even white light, in which paper is white ``[n, n, 3]`` uint8.
-        rms: Root mean square difference of the picture to the nominal texture, in 0..255, in light in which ink is black too.
-        mean: Mean difference of each channel ``[3]``.
-        far_share: Share of the picture that is off by more than a quarter of full scale, such as covered parts.
-        seen_share: Share of the print that the photograph shows.
-        uneven: See `Light`.
+        error: Their difference to the nominal texture.
     """
 
     nominal: Rgb
     seen: Rgb
     unlit: Rgb
-    rms: float
-    mean: tuple[float, float, float]
-    far_share: float
-    seen_share: float
-    uneven: float
+    error: ColourError
 
 
 def print_colours(
@@ -232,15 +244,18 @@ def print_colours(
     off = (_in_white(raw, light, points, light.black) - printed)[inside]
     unlit = _coarse(_in_white(raw, light, points, 0.0))
     red, green, blue = off.mean(axis=0)
-    return PrintColours(
-        _whole(wanted),
-        _whole(_completed(seen, wanted, hidden)),
-        _whole(_completed(unlit, wanted, hidden)),
+    error = ColourError(
         float(np.sqrt(np.mean(off**2))),
         (float(red), float(green), float(blue)),
         float((np.abs(off).max(axis=-1) > _FAR).mean()),
         float(1.0 - hidden.mean()),
         light.uneven,
+    )
+    return PrintColours(
+        _whole(wanted),
+        _whole(_completed(seen, wanted, hidden)),
+        _whole(_completed(unlit, wanted, hidden)),
+        error,
     )
 
 

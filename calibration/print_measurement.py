@@ -8,36 +8,12 @@ import numpy as np
 
 from advnerf_core.geometry import Array
 from advnerf_core.plain import Numbers, PlainData
-from calibration.print_colour import PrintColours
+from calibration.print_colour import ColourError
 from calibration.print_drive import PlacedPrint
 from calibration.print_pose import PrintPose
 
 CARD, DISTANCE, WIDTH, POSES = "a card", "the distance", "the width", "the camera's poses"
 _NO_SIZE = "unknown: one photograph gives the pose in units of the nominal size; give --card, --distance or --width, or a bag with the car's poses"
-
-
-@dataclass(frozen=True, eq=False)
-class ColourError(PlainData):
-    """Difference of a print to its nominal texture, of sRGB colours in 0..255 in even white light.
-
-    Attributes:
-        rms: Root mean square.
-        mean: Mean of each channel.
-        far_share: Share of the picture that is off by more than a quarter of full scale.
-        seen_share: Share of the picture that the photograph shows.
-        uneven: Change of the light over the print, as a share of its mean.
-    """
-
-    rms: float
-    mean: tuple[float, float, float]
-    far_share: float
-    seen_share: float
-    uneven: float
-
-    @classmethod
-    def of(cls, colours: PrintColours) -> ColourError:
-        """The errors of photographed colours."""
-        return cls(colours.rms, colours.mean, colours.far_share, colours.seen_share, colours.uneven)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,6 @@ from calibration.print_measurement import (
     CARD,
     DISTANCE,
     WIDTH,
-    ColourError,
     PrintMeasurement,
     of_drive,
     of_photograph,
@@ -255,7 +254,7 @@ def _with_colours(
         colours = print_colours(rgb, lens, T_camera_from_face, sheet, corners)
     except DegenerateDataError as error:
         return MeasuredPrint(replace(found, colours_unknown=str(error)), None, by_car)
-    return MeasuredPrint(replace(found, colours=ColourError.of(colours)), colours, by_car)
+    return MeasuredPrint(replace(found, colours=colours.error), colours, by_car)
 
 
 def _seen(rgb: Rgb, lens: Intrinsics, wanted: Mapping[int, Array]) -> dict[int, Marker]:
