@@ -23,8 +23,6 @@ class FileCamera(PlayedCamera):
     """
 
     def __init__(self, folder: Path | str, rate_hz: float = 10.0, loop: bool = True) -> None:
-        if not rate_hz > 0.0:
-            raise ValueError(f"expected a rate > 0 Hz, got {rate_hz}")
         super().__init__(folder, loop)
         self._rate_hz = rate_hz
         self._files: list[Path] = []

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from advnerf_core.strict import StrictModel
 from hardware.cameras.interface import Camera
 from hardware.cameras.steady import SteadyCamera
+from hardware.cameras.v4l2.controls import Controls
+
+Positive = Annotated[int, Field(gt=0)]
 
 
 class Source(StrictModel, ABC):
@@ -34,3 +38,21 @@ class Source(StrictModel, ABC):
     def period_s(self) -> float:
         """Time between two frames if the configuration has a rate, so that a slow rate is not a stall [s]."""
         return 0.0
+
+
+class ControlledSource(Source):
+    """A device with the standard controls of video devices.
+
+    Attributes:
+        white_balance_k: Colour temperature to fix [K]; None for automatic.
+        power_line_hz: Mains frequency for the device's flicker compensation [Hz].
+        controls: Further controls by name, in the device's own units (``advnerf car camera list`` shows them).
+    """
+
+    white_balance_k: int | None = None
+    power_line_hz: Literal[0, 50, 60] | None = None
+    controls: dict[str, int] = Field(default_factory=dict)
+
+    def device_controls(self, exposure_us: float | None = None, gain: int | None = None) -> Controls:
+        """The controls to fix, and the exposure [us] and gain beside them."""
+        return Controls(exposure_us, gain, self.white_balance_k, self.power_line_hz, self.controls)

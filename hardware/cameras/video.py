@@ -21,8 +21,6 @@ class VideoCamera(PlayedCamera):
     """
 
     def __init__(self, path: Path | str, rate_hz: float | None = None, loop: bool = True) -> None:
-        if rate_hz is not None and not rate_hz > 0.0:
-            raise ValueError(f"expected a rate > 0 Hz, got {rate_hz}")
         super().__init__(path, loop)
         self._rate_hz = rate_hz
         self._video: Any = None

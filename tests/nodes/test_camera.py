@@ -16,7 +16,7 @@ from hardware.cameras.sources import CameraSource
 from hardware.cameras.steady import SteadyCamera
 from hardware.cameras.v4l2.driver import V4l2Camera
 from hardware.cameras.v4l2.negotiation import Mode
-from hardware.cameras.zed.driver import ZedCamera
+from hardware.cameras.zed.driver import ZedCamera, ZedSource
 from nodes.camera import CameraNode, CameraNodeConfig
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.bus import Bus
@@ -290,7 +290,7 @@ def zed(tmp_path, fx):
     conf = tmp_path / "SN1.conf"
     conf.write_text(f"[LEFT_CAM_VGA]\nfx={fx}\nfy={fx}\ncx=335.5\ncy=187.5\n", encoding="utf-8")
     device = VideoDevice(formats={"YUYV": [(1344, 376)]}, extension=ZedRegisters())
-    return SteadyCamera(ZedCamera(PATH, conf, port=VideoPortEmulator({PATH: device})))
+    return SteadyCamera(ZedCamera(ZedSource(device=PATH, factory=conf), VideoPortEmulator({PATH: device})))
 
 
 def test_zed_with_its_own_calibration_publishes_the_rectified_pinhole(tmp_path):

@@ -13,7 +13,7 @@ from hardware.cameras.socket import SocketCamera
 from hardware.cameras.v4l2.driver import V4l2Camera
 from hardware.cameras.v4l2.negotiation import Mode
 from hardware.cameras.video import VideoCamera
-from hardware.cameras.zed.driver import ZedCamera
+from hardware.cameras.zed.driver import ZedCamera, ZedSource
 from hardware.emulators.frame_server import FrameServer
 from tests.support.v4l2_device import VideoDevice
 from tests.support.v4l2_emulator import VideoPortEmulator
@@ -76,7 +76,7 @@ class ZedRig(V4l2Rig):
         )
         self.device = VideoDevice(formats={"YUYV": [(1344, 376)]}, controls={}, extension=ZedRegisters())
         self.port = VideoPortEmulator({PATH: self.device})
-        self.camera = ZedCamera(PATH, self.conf, rate_hz=None, port=self.port)
+        self.camera = ZedCamera(ZedSource(device=PATH, factory=self.conf, rate_hz=None), self.port)
         self.count = 0
         self.camera._stream._skip_frames = 0
 
@@ -85,7 +85,7 @@ class ZedRig(V4l2Rig):
         self.device.expose(bytes([40 + self.count, 128]) * (1344 * 376))
 
     def missing(self, tmp_path):
-        return ZedCamera("/dev/v4l/by-id/none", self.conf, port=self.port)
+        return ZedCamera(ZedSource(device="/dev/v4l/by-id/none", factory=self.conf), self.port)
 
 
 def host_stream(feed, pipelines, sent):

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
 
 from advnerf_core.geometry import Pinhole
 from hardware.cameras.interface import Camera, Frame
+from hardware.cameras.source import ControlledSource, Positive
 from hardware.cameras.stamping import Stamper
-from hardware.cameras.v4l2.controls import Controls
 from hardware.cameras.v4l2.driver import V4l2Camera
 from hardware.cameras.v4l2.negotiation import Mode
 from hardware.cameras.v4l2.port import KernelPort, VideoPort
@@ -16,51 +19,84 @@ from hardware.cameras.zed.calibration import EYE_SIZES, Rectifier, load_factory_
 from hardware.cameras.zed.exposure import ExtensionUnit, ZedExposure, exposure_lines, lock_exposure
 
 
+class ZedSource(ControlledSource):
+    """A ZED without its SDK: its left eye, rectified.
+
+    Attributes:
+        kind: ``zed``.
+        device: Stable path, ``/dev/v4l/by-id/...ZED...-video-index0``.
+        factory: Factory calibration, ``SN<serial>.conf``.
+        mode: Resolution.
+        fps: Rate of the device: 15, 30, 60 or 100 [Hz].
+        rate_hz: Frames to deliver per second, chosen by their stamps [Hz]; None for all.
+        size: Width and height of the delivered images [px].
+        exposure_percent: Exposure to fix [% of the longest at this rate]; None for automatic.
+        gain_raw: Gain to fix, as in the sensor's register; ``advnerf car camera list`` shows the current value.
+    """
+
+    kind: Literal["zed"] = "zed"
+    device: Path
+    factory: Path
+    mode: Literal["2K", "HD1080", "HD720", "VGA"] = "VGA"
+    fps: float = 30.0
+    rate_hz: float | None = Field(default=10.0, gt=0.0)
+    size: tuple[Positive, Positive] = (336, 188)
+    exposure_percent: float | None = None
+    gain_raw: int | None = None
+    repeats: int = Field(default=15, ge=0)
+
+    @model_validator(mode="after")
+    def _possible(self) -> ZedSource:
+        _ = self.device_controls(), self.exposure  # they check their values
+        exposure_lines(100.0, self.fps)
+        width, height = EYE_SIZES[self.mode]
+        if self.size[0] > width or self.size[1] > height:
+            raise ValueError(
+                f"expected a size of at most {width} x {height} in mode {self.mode}, got {self.size}"
+            )
+        if self.rate_hz is not None and self.rate_hz > self.fps:
+            raise ValueError(f"expected rate_hz of at most fps, {self.fps:g}, got {self.rate_hz:g}")
+        return self
+
+    @property
+    def exposure(self) -> ZedExposure:
+        """Exposure and gain to fix."""
+        return ZedExposure(self.exposure_percent, self.gain_raw)
+
+    def period_s(self) -> float:
+        """Time between two frames [s]."""
+        return 1.0 / self.rate_hz if self.rate_hz else 0.0
+
+    def camera(self) -> ZedCamera:
+        """Make the camera and read its factory calibration."""
+        return ZedCamera(self)
+
+
 class ZedCamera(Camera):
     """Delivers rectified, scaled-down images of the left eye.
 
     Args:
-        path: Video device; the stable name under ``/dev/v4l/by-id``.
-        factory: The factory calibration ``SN<serial>.conf``.
-        mode: Resolution, one of `hardware.cameras.zed.calibration.EYE_SIZES`.
-        fps: Frames per second of the device: 15, 30, and up to 60 (HD720) or 100 (VGA) [Hz]; it has no 10.
-        rate_hz: Frames per second to deliver, chosen by their stamps; None for all.
-        size: Width and height of the delivered pictures [px].
-        exposure: Exposure and gain to fix.
-        controls: Standard controls. Exposure and gain in them have no effect on a ZED and are refused.
+        settings: Settings of the camera.
         port: System calls.
         stamper: Converts and checks the kernel's stamps.
+
+    Raises:
+        ZedCalibrationError: The factory calibration is missing or wrong.
     """
 
     def __init__(
-        self,
-        path: Path | str,
-        factory: Path | str,
-        mode: str = "VGA",
-        fps: float = 30.0,
-        rate_hz: float | None = 10.0,
-        size: tuple[int, int] = (336, 188),
-        exposure: ZedExposure | None = None,
-        controls: Controls | None = None,
-        port: VideoPort | None = None,
-        stamper: Stamper | None = None,
+        self, settings: ZedSource, port: VideoPort | None = None, stamper: Stamper | None = None
     ) -> None:
-        width, height = EYE_SIZES[mode]
-        exposure_lines(100.0, fps)  # refuses rates that the device does not have
-        controls = controls or Controls()
-        if controls.exposure_us is not None or controls.gain is not None:
-            raise ValueError(
-                "expected exposure_percent and gain_raw, got exposure_us or gain, which a ZED ignores; replace them"
-            )
-        self._fps = fps
-        self._exposure = exposure or ZedExposure()
+        width, height = EYE_SIZES[settings.mode]
+        self._settings = settings
         self._port: VideoPort = port or KernelPort()
-        self._rectifier = Rectifier(load_factory_calibration(factory, mode), size)
+        calibration = load_factory_calibration(settings.factory, settings.mode)
+        self._rectifier = Rectifier(calibration, settings.size)
         self._stream = V4l2Camera(
-            path,
-            Mode(2 * width, height, fps, "YUYV"),
-            controls,
-            rate_hz,
+            settings.device,
+            Mode(2 * width, height, settings.fps, "YUYV"),
+            settings.device_controls(),
+            settings.rate_hz,
             columns=(0, width),
             port=self._port,
             started=self._lock,
@@ -90,5 +126,6 @@ class ZedCamera(Camera):
         return self._stream.counters()
 
     def _lock(self, fd: int) -> None:
-        if self._exposure.exposure_percent is not None:
-            lock_exposure(ExtensionUnit(self._port, fd, self._stream.path), self._exposure, self._fps)
+        if self._settings.exposure_percent is not None:
+            unit = ExtensionUnit(self._port, fd, self._stream.path)
+            lock_exposure(unit, self._settings.exposure, self._settings.fps)

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import Pinhole
-from hardware.cameras.v4l2.controls import Controls
 from hardware.cameras.zed.calibration import (
     EyeCalibration,
     Rectifier,
     ZedCalibrationError,
     load_factory_calibration,
 )
-from hardware.cameras.zed.driver import ZedCamera
+from hardware.cameras.zed.driver import ZedCamera, ZedSource
 from hardware.cameras.zed.exposure import (
     ExtensionUnit,
     ZedExposure,
@@ -200,9 +199,7 @@ def test_impossible_settings(zed_conf):
         with pytest.raises(ValueError, match="expected"):
             ZedExposure(**wrong)
     with pytest.raises(ValueError, match="expected a rate of 15, 30, 60, 100 Hz, got 10"):
-        ZedCamera(PATH, zed_conf, fps=10.0)
-    with pytest.raises(ValueError, match="expected exposure_percent and gain_raw"):
-        ZedCamera(PATH, zed_conf, controls=Controls(exposure_us=100))
+        ZedSource(device=PATH, factory=zed_conf, fps=10.0)
 
 
 # The whole camera
@@ -220,7 +217,8 @@ def side_by_side():
 def test_left_eye_rectified_at_ten_hertz_with_exposure_fixed(zed_conf):
     registers = ZedRegisters()
     video = zed_device(registers)
-    camera = ZedCamera(PATH, zed_conf, exposure=ZedExposure(40.0), port=VideoPortEmulator({PATH: video}))
+    settings = ZedSource(device=PATH, factory=zed_conf, exposure_percent=40.0)
+    camera = ZedCamera(settings, VideoPortEmulator({PATH: video}))
     camera.open()
     assert read_exposure_lines(unit_of(registers)) == 440
     assert (video.width, video.height, video.rate) == (1344, 376, 30.0)
@@ -245,6 +243,6 @@ def test_left_eye_rectified_at_ten_hertz_with_exposure_fixed(zed_conf):
 
 def test_device_that_falls_back_to_another_mode_is_refused(zed_conf):
     video = VideoDevice(formats={"YUYV": [(2560, 720)]}, rates=(30.0,), extension=ZedRegisters())
-    camera = ZedCamera(PATH, zed_conf, port=VideoPortEmulator({PATH: video}))
+    camera = ZedCamera(ZedSource(device=PATH, factory=zed_conf), VideoPortEmulator({PATH: video}))
     with pytest.raises(ProtocolError, match=r"expected 1344 x 376 YUYV .*got 2560 x 720"):
         camera.open()
