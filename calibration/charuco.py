@@ -13,6 +13,8 @@ from advnerf_core.geometry import Array
 from calibration.schema import CalibrationError
 
 MIN_CORNERS = 6
+# A pose is ambiguous where the error of the first solution is above this share of the second's.
+_AMBIGUOUS = 0.6
 
 
 @dataclass(frozen=True)
@@ -109,21 +111,20 @@ class BoardDetector:
         return Detection(points, pixels + 0.5)
 
 
-def board_pose(found: Detection, matrix: Array, distortion: Array, most_ratio: float = 0.6) -> Array | None:
+def board_pose(found: Detection, matrix: Array, distortion: Array) -> Array | None:
     """Pose ``T_camera_from_board`` ``[4, 4]`` of a board in one picture; None where two tilts explain it about equally well.
 
     Args:
         found: Corners.
         matrix: Camera matrix ``[3, 3]``, pixel centres at +0.5.
         distortion: OpenCV's coefficients.
-        most_ratio: The pose is ambiguous where the error of the first solution is above this share of the second's.
     """
     count, turns, moves, errors = cv2.solvePnPGeneric(
         found.board_m, found.pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE
     )
     if count == 0 or not np.isfinite(turns).all():
         return None
-    if count > 1 and errors[0, 0] > most_ratio * errors[1, 0]:
+    if count > 1 and errors[0, 0] > _AMBIGUOUS * errors[1, 0]:
         return None
     turn, move = cv2.solvePnPRefineLM(found.board_m, found.pixels, matrix, distortion, turns[0], moves[0])
     T = np.eye(4)

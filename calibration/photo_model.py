@@ -169,11 +169,6 @@ class Model(PlainData):
     cameras: tuple[FoundCamera, ...] = ()
 
     @property
-    def unregistered(self) -> tuple[str, ...]:
-        """Names of the images without a pose."""
-        return tuple(image.name for image in self.left_out)
-
-    @property
     def poses(self) -> Array:
         """``T_world_from_camera`` ``[N, 4, 4]``."""
         return np.stack([image.T_world_from_camera for image in self.images])

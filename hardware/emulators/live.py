@@ -35,6 +35,7 @@ from hardware.worlds.lab.lab import Lab
 _LONGEST_STEP_S = 0.5
 _HISTORY_S = 2.0
 _HELD_UP_S = 0.2
+_BUILDING_S = 60.0
 
 
 class LiveLabConfig(StrictModel):
@@ -125,7 +126,6 @@ class LiveLab:
         config: Configuration of the twin.
         run_dir: Folder for the link and the log.
         socket_dir: Folder for the socket, whose path may have at most 107 characters; None uses the run folder.
-        ready_timeout_s: Limit for building the world [s].
 
     Attributes:
         vesc: The motor controller, with its wire log.
@@ -137,7 +137,6 @@ class LiveLab:
         config: LiveLabConfig,
         run_dir: Path,
         socket_dir: Path | None = None,
-        ready_timeout_s: float = 60.0,
     ) -> None:
         self.config = config
         self.vesc_port = run_dir / "vesc"
@@ -162,7 +161,7 @@ class LiveLab:
             self._opened.callback(self.vesc.close)
             self._start(self._run_physics, "twin physics")
             self._start(self._run_camera, "twin camera")
-            self._wait_until_ready(ready_timeout_s)
+            self._wait_until_ready()
             # Last: who sees poses may count on pictures.
             self.vicon = ViconEmulator(config.vicon, self._subject_poses)
             self._opened.callback(self.vicon.close)
@@ -219,10 +218,10 @@ class LiveLab:
             self._stop.set()
             self._ready.set()
 
-    def _wait_until_ready(self, timeout_s: float) -> None:
-        if not self._ready.wait(timeout_s):
+    def _wait_until_ready(self) -> None:
+        if not self._ready.wait(_BUILDING_S):
             raise HardwareError(
-                f"expected the simulated lab to render an image within {timeout_s:g} s, got none; does EGL hang? Run advnerf doctor"
+                f"expected the simulated lab to render an image within {_BUILDING_S:g} s, got none; does EGL hang? Run advnerf doctor"
             )
         self.check()
 

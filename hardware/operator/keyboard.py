@@ -19,6 +19,8 @@ from hardware.operator.hands import Hands
 
 _DRIVE = {"w": (1.0, 0.0), "a": (1.0, 1.0), "d": (1.0, -1.0), "s": (-1.0, 0.0)}
 _AUTONOMY, _STOP, _REARM = "o", " ", "r"
+# A repeat that comes later than this after the last one does not count.
+_LATE_NS = 150_000_000
 HELP = "hold w a d s: drive, hold o: let the software drive, space: e-stop, r: re-arm, Ctrl-C: end"
 
 
@@ -27,15 +29,14 @@ class Keyboard:
 
     Args:
         mono_ns: Monotonic clock [ns].
-        late_s: A repeat that comes later than this after the last one does not count [s].
     """
 
-    def __init__(self, fd: int, mono_ns: Callable[[], int], late_s: float = 0.15) -> None:
+    def __init__(self, fd: int, mono_ns: Callable[[], int]) -> None:
         if not os.isatty(fd):
             raise HardwareError(
                 "expected a terminal to read keys from, got none; run the command in a terminal, or use a gamepad"
             )
-        self._fd, self._mono_ns, self._late_ns = fd, mono_ns, round(late_s * 1e9)
+        self._fd, self._mono_ns = fd, mono_ns
         self._before: list[Any] | None = termios.tcgetattr(fd)
         tty.setcbreak(fd, termios.TCSANOW)
         self._key, self._repeats, self._key_ns = "", 0, 0
@@ -48,7 +49,7 @@ class Keyboard:
             if select.select([self._fd], [], [], timeout_s)[0] and not self._lost:
                 self._take()
         now_ns = self._mono_ns()
-        held = self._key if self._repeats >= 2 and now_ns - self._key_ns <= self._late_ns else ""
+        held = self._key if self._repeats >= 2 and now_ns - self._key_ns <= _LATE_NS else ""
         throttle, steering = _DRIVE.get(held, (0.0, 0.0))
         return Hands(
             held in _DRIVE,
@@ -82,5 +83,5 @@ class Keyboard:
             return
         # A burst after a pause shows pressed keys, not a held one: it counts as one.
         key = keys[-1]
-        again = key == self._key and now_ns - self._key_ns <= self._late_ns
+        again = key == self._key and now_ns - self._key_ns <= _LATE_NS
         self._key, self._repeats, self._key_ns = key, self._repeats + 1 if again else 0, now_ns

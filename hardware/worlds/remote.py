@@ -68,6 +68,9 @@ class RemoteServer:
         ServerLost: The process does not start.
         ServerTimeout: The server does not answer in time.
         ServerVersionError: The server uses another version of the protocol.
+
+    Attributes:
+        process: The process.
     """
 
     def __init__(
@@ -88,15 +91,14 @@ class RemoteServer:
         self._socket.setsockopt(zmq.MAXMSGSIZE, _LARGEST_BYTES)
         endpoint = f"ipc://{self._folder}/socket"
         self._socket.bind(endpoint)
-        self._process: subprocess.Popen[bytes] | None = None
         try:
-            self._process = self._start([str(python), "-I", str(server), str(simulator), endpoint])
+            self.process = self._start([str(python), "-I", str(server), str(simulator), endpoint])
         except OSError as error:
             _end(None, self._context, self._folder)
             raise ServerLost(
                 f"world {name}: expected to start {python}, got: {error}; run `advnerf scene world install {name}` again"
             ) from error
-        self._end = weakref.finalize(self, _end, self._process, self._context, self._folder)
+        self._end = weakref.finalize(self, _end, self.process, self._context, self._folder)
         self.call("hello", {}, {}, starting_s)
 
     def _start(self, command: Sequence[str]) -> subprocess.Popen[bytes]:
@@ -110,17 +112,6 @@ class RemoteServer:
                 cwd=self._folder,
                 start_new_session=True,
             )
-
-    @property
-    def pid(self) -> int:
-        """Process id of the server."""
-        assert self._process is not None, "it was started by the constructor"
-        return self._process.pid
-
-    @property
-    def alive(self) -> bool:
-        """Whether the process runs, and was not ended by a fault."""
-        return self._end.alive and self._process is not None and self._process.poll() is None
 
     def call(self, name: str, arguments: Mapping[str, Any], arrays: Arrays, deadline_s: float) -> ServerReply:
         """Call the simulator and wait for the answer.
@@ -147,8 +138,7 @@ class RemoteServer:
 
     def kill(self) -> None:
         """End the process at once; safe to call twice."""
-        if self._process is not None:
-            _kill_all(self._process)
+        _kill_all(self.process)
         self.close()
 
     def _call(
@@ -177,16 +167,15 @@ class RemoteServer:
 
     def _wait(self, name: str, event: int, end_s: float, deadline_s: float) -> None:
         """Wait until the socket is ready, the process ends, or time is up."""
-        assert self._process is not None, "it was started by the constructor"
         while True:
             left_ms = math.ceil(1e3 * (end_s - time.monotonic()))
-            ended = self._process.poll() is not None
+            ended = self.process.poll() is not None
             if self._socket.poll(max(0, min(_LOOK_MS, left_ms)), event):
                 return
             if ended:
                 raise ServerLost(
                     f"world {self.name}: expected an answer to {name}, got the end of its process "
-                    f"({_how(self._process.returncode)}){self._said()}; the drive does not count, run it again"
+                    f"({_how(self.process.returncode)}){self._said()}; the drive does not count, run it again"
                 )
             if left_ms <= 0:
                 raise ServerTimeout(

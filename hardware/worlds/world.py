@@ -290,16 +290,6 @@ class Traits:
 
 
 @runtime_checkable
-class HasTraits(Protocol):
-    """A world whose traits are not the defaults."""
-
-    @property
-    def traits(self) -> Traits:
-        """Properties that are known before the world is opened."""
-        ...
-
-
-@runtime_checkable
 class Overview(Protocol):
     """A world with a view from above, for reports."""
 
@@ -376,7 +366,7 @@ def collided_with(world: World, pose: ArrayLike) -> str:
 
 def traits_of(world: World) -> Traits:
     """Properties of a world that are known before it is opened."""
-    return world.traits if isinstance(world, HasTraits) else Traits()
+    return getattr(world, "traits", Traits())
 
 
 def members_of_a_world() -> tuple[str, ...]:

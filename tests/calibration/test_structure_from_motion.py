@@ -47,7 +47,7 @@ def scene(tmp_path_factory):
 def test_poses_and_lens_of_two_cameras_are_found(scene):
     root, sources, truth = scene
     model = reconstruct(root, sources, root / "work")
-    assert model.unregistered == ()
+    assert model.left_out == ()
     assert [image.name for image in model.images] == list(truth)
     aligned = align_poses(model.poses, np.stack([truth[i.name] for i in model.images]), 0.1, 0.1, 1.0)
     assert aligned.position_error_m.max() < 0.01 * aligned.extent_m
@@ -122,7 +122,7 @@ def test_ten_photographs_by_ten_cameras_have_ten_sane_lenses(tmp_path):
     )
     assert len(model.images) >= 8
     assert np.abs(true_focal_lengths(model, truth)).max() < 0.05
-    assert {image.name for image in model.images} | set(model.unregistered) == set(truth)
+    assert {image.name for image in model.images} | {image.name for image in model.left_out} == set(truth)
     listed = {camera.camera_id: camera for camera in model.cameras}
     assert [image.camera_id for image in model.images] == list(listed), "each by its own name"
     assert set(listed) <= {f"photos/{index:02d}" for index in range(10)}
@@ -147,7 +147,7 @@ def test_eleven_photographs_by_one_camera_give_its_focal_length(tmp_path):
     # Two folders, but one camera: they share its lens.
     sources = [PhotoSource("camera", names[:6]), PhotoSource("camera", names[6:])]
     model = reconstruct(tmp_path, sources, tmp_path / "work", FEW_FEATURES)
-    assert model.unregistered == ()
+    assert model.left_out == ()
     assert [(camera.camera_id, camera.images) for camera in model.cameras] == [("camera", 11)]
     assert np.abs(true_focal_lengths(model, truth)).max() < 0.01
     assert model.images[0].lens.coefficients[0] == pytest.approx(-0.08, abs=0.03)
@@ -187,7 +187,7 @@ def test_a_camera_whose_lens_cannot_be_told_is_left_out_by_name_or_held_at_its_e
         assert "EXIF focal length, held" in cameras["photos/05"].why
         assert cameras["photos/05"].pinhole.fx == pytest.approx(500.0, rel=0.05)
     else:
-        assert model.unregistered == (last,)
+        assert [image.name for image in model.left_out] == [last]
         assert "focal length is only known within" in model.left_out[0].why
     # What was finished says the same again.
     again = reconstruct(tmp_path, [PhotoSource("photos", tuple(names))], tmp_path / "work", FEW_FEATURES)

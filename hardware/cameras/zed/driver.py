@@ -11,7 +11,6 @@ from pydantic import Field, model_validator
 from advnerf_core.geometry import Pinhole
 from hardware.cameras.interface import Camera, Frame
 from hardware.cameras.source import ControlledSource, Positive
-from hardware.cameras.stamping import Stamper
 from hardware.cameras.v4l2.driver import V4l2Camera
 from hardware.cameras.v4l2.negotiation import Mode
 from hardware.cameras.v4l2.port import KernelPort, VideoPort
@@ -78,15 +77,12 @@ class ZedCamera(Camera):
     Args:
         settings: Settings of the camera.
         port: System calls.
-        stamper: Converts and checks the kernel's stamps.
 
     Raises:
         ZedCalibrationError: The factory calibration is missing or wrong.
     """
 
-    def __init__(
-        self, settings: ZedSource, port: VideoPort | None = None, stamper: Stamper | None = None
-    ) -> None:
+    def __init__(self, settings: ZedSource, port: VideoPort | None = None) -> None:
         width, height = EYE_SIZES[settings.mode]
         self._settings = settings
         self._port: VideoPort = port or KernelPort()
@@ -100,7 +96,6 @@ class ZedCamera(Camera):
             columns=(0, width),
             port=self._port,
             started=self._lock,
-            stamper=stamper,
         )
 
     @property

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
+from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at
 from hardware.worlds.footprints import Footprint
 from hardware.worlds.lab import textures
 from hardware.worlds.lab.config import LabConfig, MonitorOpticsConfig
@@ -179,7 +179,7 @@ class Lab(SeenWorld):
         pinhole = Pinhole(width, height, focal, focal, 0.5 * width, 0.5 * height)
         side = self.config.room.side_m
         T = look_at([0.0, -1.12 * side, 1.12 * side], [0.0, -0.3, 0.0])
-        self._renderer.place("car", planar_pose(*self._pose()), hidden_groups=(CEILING_GROUP,))
+        self._renderer.place("car", self.state.T_world_from_car, hidden_groups=(CEILING_GROUP,))
         try:
             return self._renderer.render_rgb(T, pinhole), pinhole, T
         finally:
@@ -266,10 +266,6 @@ class Lab(SeenWorld):
             if self._optics is not None:
                 self.set_monitor_image(None)
         return self
-
-    def _pose(self) -> tuple[float, float, float]:
-        state = self._car.state
-        return state.x_m, state.y_m, state.yaw_rad
 
     def _see(self, T_world_from_car: Array, depth: bool) -> View:
         T = T_world_from_car @ self.T_car_from_camera

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -66,17 +66,14 @@ def paint_room(config: LabConfig) -> tuple[dict[str, Surface], Image]:
     tape: Image = np.full((TAPE_PIXELS, TAPE_PIXELS, 3), config.track.tape_rgb, dtype=np.float32)
     lit = {}
     for surface in surfaces:
-        light = None if surface.name == "ceiling" else _light(config, surface)
-        lit[surface.name] = (
-            surface if light is None else _with_image(surface, textures.with_light(surface.image, light))
-        )
-        if surface.name == "floor" and light is not None:
+        if surface.name == "ceiling":
+            lit[surface.name] = surface
+            continue
+        light = _light(config, surface)
+        lit[surface.name] = replace(surface, image=textures.with_light(surface.image, light))
+        if surface.name == "floor":
             tape = textures.with_light(tape, light)
     return lit, tape
-
-
-def _with_image(surface: Surface, image: Image) -> Surface:
-    return Surface(surface.name, surface.centre_m, surface.right, surface.up, surface.half_m, image)
 
 
 def _light(config: LabConfig, surface: Surface) -> Array:

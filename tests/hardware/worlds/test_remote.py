@@ -91,7 +91,7 @@ def test_a_server_that_is_killed_between_calls_is_lost(sent: int) -> None:
     with FlatWorld(FlatConfig()) as world:
         world.reset(6.0, 0.0, 0.0)
         assert world.server is not None
-        os.kill(world.server.pid, sent)
+        os.kill(world.server.process.pid, sent)
         with pytest.raises(ServerLost, match=signal.Signals(sent).name):
             world.step(0.0, 1.2, 0.1)
 
@@ -112,7 +112,7 @@ def test_what_the_process_wrote_is_told(tmp_path: Path) -> None:
     server = RemoteServer("broken", Path(sys.executable), simulator)
     with pytest.raises(ServerLost, match=r"exit code 7.*no display of mine"):
         server.call("open", {"config": {}, "cameras": {}}, {}, 10.0)
-    assert not server.alive
+    assert server.process.poll() is not None
 
 
 def test_an_interpreter_that_is_not_there_is_named(tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_the_server_dies_with_its_client(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys\nfrom pathlib import Path\nfrom tests.support.remote.flat_world import FlatConfig, FlatWorld\n"
         "world = FlatWorld(FlatConfig()).__enter__()\n"
-        f"Path({str(told)!r}).write_text(str(world.server.pid))\nos.kill(os.getpid(), signal.SIGKILL)\n"
+        f"Path({str(told)!r}).write_text(str(world.server.process.pid))\nos.kill(os.getpid(), signal.SIGKILL)\n"
     )
     root = Path(__file__).parents[3]
     subprocess.run([sys.executable, "-c", code], cwd=root, env={**os.environ, "PYTHONPATH": str(root)})

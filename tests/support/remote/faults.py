@@ -70,7 +70,7 @@ def suffer(
     """Have a fault happen in a drive; what was raised, and whether the process has ended."""
     world.reset(6.0, 0.0, 0.0)  # starts a process where the last one was lost
     assert world.server is not None
-    pid = world.server.pid
+    pid = world.server.process.pid
     plan_fault(folder, call, kind, 0 if call == "reset" else after)
     try:
         drive(world)
