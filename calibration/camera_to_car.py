@@ -124,7 +124,6 @@ def calibrate_mount(
 
     Args:
         views: Views while everything stood still; all with a tracked board, or none.
-        camera: Calibrated lens.
         T_board_from_pattern: Pose of the print on the tracked board ``[4, 4]``, probed with a wand; None solves for it.
 
     Raises:

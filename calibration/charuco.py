@@ -115,7 +115,6 @@ def board_pose(found: Detection, matrix: Array, distortion: Array) -> Array | No
     """Pose ``T_camera_from_board`` ``[4, 4]`` of a board in one picture; None where two tilts explain it about equally well.
 
     Args:
-        found: Corners.
         matrix: Camera matrix ``[3, 3]``, pixel centres at +0.5.
         distortion: OpenCV's coefficients.
     """

@@ -37,7 +37,6 @@ def length_scale(
     Args:
         points_by_id: Points ``[3]`` by the number that COLMAP shows.
         one: Name of an image, for the position of its camera, or the number of a point in COLMAP.
-        other: The other end.
         length_m: Distance between both [m].
 
     Raises:
@@ -134,7 +133,6 @@ def marker_scale(views: Iterable[View], side_m: float, dictionary: str) -> Marke
     """Metres per unit of a model, from square markers that its images show.
 
     Args:
-        views: Undistorted images.
         side_m: Side of a marker's black square [m].
         dictionary: OpenCV's name of the markers, such as ``DICT_APRILTAG_36h11``.
 

@@ -98,7 +98,6 @@ def choose_lenses(
         reconstruction: COLMAP's model, with ``FIRST_MODEL`` for cameras that are not held; changed in place.
         held: Cameras whose intrinsics are known.
         exif_focal_px: Focal lengths from the photographs' EXIF data, by camera [px].
-        report: Progress callback.
 
     Returns:
         The choice for each remaining camera, and the reason for each image that was removed.

@@ -38,7 +38,6 @@ def chosen_pairs(
         sequences: Images in the order of each video.
         overlap: Number of an image's followers in its video.
         look_alikes: Number of similar images, out of all.
-        seed: Seed of the vocabulary.
     """
     pairs: set[tuple[int, int]] = set()
     for order in sequences:

@@ -86,7 +86,6 @@ def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: S
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        lens: Lens of the camera.
         T_camera_from_face: Pose ``[4, 4]`` of the print in nominal units.
         corners_m: Nominal corners ``[4, 3]`` of each seen marker [m].
 
@@ -147,10 +146,8 @@ def patch_colours(
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        lens: Lens of the camera.
         T_camera_from_face: Pose ``[4, 4]`` of the chart in nominal units.
         picture_m: Width and height of all patches [m].
-        shape: Rows and columns.
         corners_m: Nominal corners ``[4, 3]`` of each seen marker [m].
 
     Raises:
@@ -218,9 +215,7 @@ def print_colours(
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        lens: Lens of the camera.
         T_camera_from_face: Pose ``[4, 4]`` of the print in nominal units.
-        sheet: The printed sheet.
         corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
 
     Raises:

@@ -60,7 +60,6 @@ def find_markers(
 
     Args:
         rgb: The photograph ``[H, W, 3]``, as the lens draws it.
-        lens: Lens of the camera.
         wanted: Markers by number.
         what: Name of the sheet, for messages.
 

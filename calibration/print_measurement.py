@@ -142,10 +142,8 @@ def of_photograph(
     """The measurement of one photograph, without colours.
 
     Args:
-        source: Name of the photograph.
         nominal_m: Nominal width and height of the picture [m].
         printed: Number of markers on the print.
-        pose: The fitted pose.
         known: Source of the size, true over nominal size, and its standard deviation; None where nothing gives it.
         T_world_from_camera: Pose ``[4, 4]`` of the camera in the world; None if unknown.
     """

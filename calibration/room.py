@@ -70,7 +70,6 @@ def start_before_corner(path: Path, corner: int, before_m: float) -> tuple[float
     """Pose on a path a distance before one of its arcs.
 
     Args:
-        path: The path.
         corner: Number of the arc, from 1.
         before_m: Distance along the path [m].
     """
@@ -99,11 +98,9 @@ def target_of_size(
     """An upright rectangle in its subject's frame, from a ruler.
 
     Args:
-        subject: Motion-capture subject.
         size_m: Width and height [m].
         centre_m: Middle of the rectangle in the subject's frame [m].
         normal_yaw_rad: Direction of its normal, about the subject's z axis [rad]; 0 is along x.
-        method: Measuring method.
     """
     if min(size_m) <= 0.0:
         raise DegenerateDataError(f"expected a width and a height > 0, got {size_m[0]:g} x {size_m[1]:g} m")

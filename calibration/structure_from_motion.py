@@ -36,9 +36,7 @@ def reconstruct(
 
     Args:
         root: Folder of all images.
-        sources: The cameras and their images.
         work: Folder for data between runs; with other images or another configuration its content is replaced.
-        config: Settings.
         report: Progress callback; an exception from it (Ctrl-C, SIGTERM) stops the run at once, and the next run resumes from there.
 
     Raises:

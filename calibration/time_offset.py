@@ -131,7 +131,6 @@ def fit_offset(turns: Turns, pose_s: Array, yaw_rad: Array) -> OffsetFit:
     """Find the offset between both clocks.
 
     Args:
-        turns: Turns measured in the images.
         pose_s: Stamps of the poses, increasing ``[M]`` [s].
         yaw_rad: The car's yaw, unwrapped ``[M]`` [rad].
 

@@ -66,7 +66,6 @@ def trajectory_of(stamps_ns: Sequence[int], values: Array, file: Path) -> Trajec
     Args:
         stamps_ns: Time of each row [ns].
         values: Rows ``x y z qx qy qz qw``, ``[N, 7]``.
-        file: Their file, for errors.
 
     Raises:
         ScanError: No row is usable.

@@ -135,7 +135,6 @@ class ImperfectCamera:
         """The picture ``[H, W, 3]`` of a tick, None if it is lost; the first one never is. Call it once for each tick, in order.
 
         Args:
-            draw: Ideal pictures.
             state: Current state of the car ``[3]``; the exposure of the last row ends there.
             dt_s: Time since the call before [s].
         """

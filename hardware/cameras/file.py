@@ -17,8 +17,6 @@ class FileCamera(PlayedCamera):
     """Delivers the images of a folder in the order of their names.
 
     Args:
-        folder: Folder of the images.
-        rate_hz: Rate of frames [Hz].
         loop: Start over after the last image. Otherwise the device is lost, like an unplugged camera.
     """
 

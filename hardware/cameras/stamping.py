@@ -21,10 +21,6 @@ class Stamper:
     stamped on reception. If it has, a frame with another stamp is considered old and is not delivered. After ten of them in a row its
     clock has jumped, and frames are stamped on reception until the stamps are valid again.
 
-    Args:
-        monotonic_ns: Monotonic time [ns].
-        realtime_ns: Real time [ns].
-
     Attributes:
         replaced: Number of frames stamped on reception.
         refused: Number of frames that were not delivered because of their stamp.

@@ -18,8 +18,6 @@ class SteadyCamera:
         first_frame_s: The same time for the first frame after opening [s].
         repeats: Number of identical images in a row that count as a stall; 0 for never. Sensor noise makes real images differ.
         pauses_s: First and longest pause before another attempt, doubled each time [s].
-        now_s: Returns the monotonic time [s].
-        sleep: Sleeps for a time [s].
 
     Attributes:
         error: Current error; empty while frames arrive.

@@ -123,7 +123,6 @@ class LiveLab:
     In the run folder: ``vesc`` (link to the pty), ``vesc_wire.csv`` (bytes that the controller read); in the socket folder: ``frames``, and ``monitor``, the plug of the monitor.
 
     Args:
-        config: Configuration of the twin.
         run_dir: Folder for the link and the log.
         socket_dir: Folder for the socket, whose path may have at most 107 characters; None uses the run folder.
 

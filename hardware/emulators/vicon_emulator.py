@@ -97,7 +97,6 @@ class ViconEmulator:
     """Sends frames from a separate thread.
 
     Args:
-        config: Rate, address and noise.
         poses: Called from the sending thread for the true poses at a monotonic time [ns].
     """
 

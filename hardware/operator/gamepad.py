@@ -77,7 +77,6 @@ class Gamepad:
     """A gamepad, opened at the first read and reopened after it was unplugged.
 
     Args:
-        path: Device file.
         layout: Codes; None uses the usual ones of the interface.
         mono_ns: Clock that paces opening [ns].
         ioctl: Replacement of the system call for emulated devices.

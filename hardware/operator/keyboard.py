@@ -25,11 +25,7 @@ HELP = "hold w a d s: drive, hold o: let the software drive, space: e-stop, r: r
 
 
 class Keyboard:
-    """The terminal on a file descriptor, in raw mode while it is open.
-
-    Args:
-        mono_ns: Monotonic clock [ns].
-    """
+    """The terminal on a file descriptor, in raw mode while it is open."""
 
     def __init__(self, fd: int, mono_ns: Callable[[], int]) -> None:
         if not os.isatty(fd):

@@ -134,11 +134,7 @@ class PygameDisplay:
 
 
 class TwinDisplay:
-    """The monitor of the simulated lab; see `hardware.emulators.monitor_port` for the protocol.
-
-    Args:
-        path: Socket of the twin's monitor.
-    """
+    """The monitor of the simulated lab; see `hardware.emulators.monitor_port` for the protocol."""
 
     def __init__(self, path: Path | str) -> None:
         self._path = Path(path)

@@ -51,7 +51,6 @@ def touched_by(body: Footprint, obstacles: Iterable[Footprint], half_m: float, e
     """Name of the obstacle that a body stands against: the nearest within 0.2 m, as a car stops just before it; empty if none is near.
 
     Args:
-        obstacles: Named footprints.
         half_m: The world ends at plus and minus this in x and y [m].
         edge: Name for the world's end, such as wall.
     """

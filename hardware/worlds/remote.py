@@ -117,8 +117,6 @@ class RemoteServer:
         """Call the simulator and wait for the answer.
 
         Args:
-            name: Name of the call.
-            arguments: JSON data.
             arrays: Arrays by name: uint8, float32 or float64.
             deadline_s: Largest time until the answer [s].
 

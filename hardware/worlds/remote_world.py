@@ -69,7 +69,6 @@ class RemoteWorld(ABC):
         T_car_from_camera: Pose ``[4, 4]`` of the driving camera on the car.
         range_m: Nearest and farthest depth that the cameras give [m]; anything farther is infinite.
         lowest_m: Height of the lowest ground [m].
-        deadlines: Time limits of calls.
         server: Server script; another file than ``serve.py`` only in tests.
 
     Attributes:

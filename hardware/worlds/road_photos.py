@@ -27,11 +27,6 @@ def road_photo_poses(
     looks aside, and two from above the lane, looking along it or across it. Lengths are in units of the camera's height and the lane's width, so
     that a street of model cars is photographed as a street of cars.
 
-    Args:
-        lane_width_m: Width of a lane [m].
-        camera: Driving camera.
-        rng: Source of all randomness.
-
     Returns:
         ``T_world_from_camera`` ``[4, 4]`` each.
     """

@@ -74,10 +74,6 @@ class ZedSource(ControlledSource):
 class ZedCamera(Camera):
     """Delivers rectified, scaled-down images of the left eye.
 
-    Args:
-        settings: Settings of the camera.
-        port: System calls.
-
     Raises:
         ZedCalibrationError: The factory calibration is missing or wrong.
     """

@@ -67,11 +67,7 @@ def exposure_lines(percent: float, fps: float) -> int:
 
 
 class ExtensionUnit:
-    """Reads and writes the registers of an open ZED.
-
-    Args:
-        sleep: Waits [s].
-    """
+    """Reads and writes the registers of an open ZED."""
 
     def __init__(
         self, port: VideoPort, fd: int, path: Path, sleep: Callable[[float], None] = time.sleep

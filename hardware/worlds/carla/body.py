@@ -26,7 +26,6 @@ class CarlaCar:
     Args:
         world: A ``carla.World``.
         library: The ``carla`` module.
-        config: Body, limits, and the labels of solid objects.
         undo: Receives the action that removes the body.
 
     Raises:

@@ -65,8 +65,6 @@ class CarlaCamera:
         library: The ``carla`` module.
         kind: `RGB` or `DEPTH`.
         pinhole: Size and focal length; the principal point must be in the middle, as CARLA supports no other.
-        pose: Initial pose.
-        render: Attributes and exposure.
         undo: Receives the action that removes the camera.
 
     Raises:

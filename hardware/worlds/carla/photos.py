@@ -24,10 +24,6 @@ def photo_poses(
     its lane and looks aside, and two from 3 to 6 m above a lane towards the junction. The surroundings of the
     road are unknown, so no camera goes farther from a lane's middle than about a lane's width.
 
-    Args:
-        config: Driving camera.
-        rng: Source of all randomness.
-
     Returns:
         ``T_world_from_camera`` ``[4, 4]`` each.
     """

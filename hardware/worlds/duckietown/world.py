@@ -27,9 +27,6 @@ class Duckietown(InstalledWorld):
 
     Its paths are the closed routes along the lanes' middles, named by direction: ``left`` (counter-clockwise from above) and ``right``. The
     world's x is Duckietown's, its y is Duckietown's -z, and z points up. The robot is in no picture.
-
-    Args:
-        config: All numbers of the world.
     """
 
     Config: ClassVar[type[DuckietownConfig]] = DuckietownConfig

@@ -28,9 +28,6 @@ class Filament(InstalledWorld):
 
     The scene is composed here and sent as files. The car drives here too, by the same code, so that the same commands move it exactly as in the
     lab; the other process only draws. The car's own body is in no picture.
-
-    Args:
-        config: All numbers of the world.
     """
 
     Config: ClassVar[type[FilamentConfig]] = FilamentConfig

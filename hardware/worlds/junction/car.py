@@ -19,7 +19,6 @@ class DubinsCar:
     ``x' = v cos(yaw)``, ``y' = v sin(yaw)``, ``yaw' = w``, and ``w' = (gain u - w) / lag``, or ``w = gain u`` with no lag.
 
     Args:
-        config: Bounds and flaws of the car.
         fits: Whether the car may stand at x [m], y [m], yaw [rad]; the car stops before a pose where it may not.
     """
 

@@ -29,12 +29,8 @@ def facade(
     """One wall of a house.
 
     Args:
-        width_m: Width of the wall [m].
-        height_m: Height of the wall [m].
         wall_rgb: Colour of the wall, 0..1.
-        style: Kind of house.
         front: Whether this wall has the door.
-        rng: Source of the variation between houses.
 
     Returns:
         Picture ``[H, W, 3]``, row 0 on top, unlit.

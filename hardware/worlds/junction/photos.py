@@ -22,9 +22,6 @@ def photo_poses(config: IntersectionConfig, count: int, rng: np.random.Generator
     Of ten photos six are taken close to a path at about the driving camera's height, two from a car that has left its lane
     and looks aside, and two from 3 to 7 m above the ground looking at the junction.
 
-    Args:
-        rng: Source of all randomness.
-
     Returns:
         ``T_world_from_camera`` ``[4, 4]`` each, none inside a house or a tree.
     """

@@ -51,7 +51,6 @@ def walk_around_poses(config: LabConfig, count: int, rng: np.random.Generator) -
 
     Args:
         config: The lab; the phone stays clear of its furniture.
-        rng: Source of all randomness.
 
     Returns:
         ``T_world_from_camera`` ``[4, 4]`` each.
@@ -80,9 +79,6 @@ def car_mounted_poses(config: LabConfig, count: int, rng: np.random.Generator) -
 
     The camera height varies over ``phone.mount_height_m``, the pitch is the driving camera's plus or minus 3 degrees.
     Places where the car's body would not fit are left out.
-
-    Args:
-        rng: Source of all randomness.
 
     Returns:
         ``T_world_from_camera`` ``[4, 4]`` each.

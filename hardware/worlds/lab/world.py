@@ -34,7 +34,6 @@ def build_model(config: LabConfig, stood: Mapping[str, tuple[Panel, Rgb]] = Mapp
     can be replaced while it runs (``Renderer.set_texture``).
 
     Args:
-        config: All numbers of the lab.
         stood: Additional panels, each with its texture ``[h, w, 3]``, by the texture's name. The furniture's
             lights shade them.
 

@@ -28,9 +28,6 @@ class MetaDrive(InstalledWorld):
 
     The world's axes are those of MetaDrive's renderer: x along the first straight, z up, the middle of the road at y = 0. The body of the car is
     in no picture.
-
-    Args:
-        config: All numbers of the world.
     """
 
     Config: ClassVar[type[MetaDriveConfig]] = MetaDriveConfig
