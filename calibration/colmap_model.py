@@ -157,7 +157,7 @@ def _model(
         T = np.eye(4)
         T[:3] = image.cam_from_world().inverse().matrix()
         pinhole, lens = intrinsics(image.camera)
-        registered.append(Registered(name, camera_ids[image.camera_id], T, pinhole, lens, image.num_points3D))
+        registered.append(Registered(name, camera_ids[image.camera_id], T, pinhole, lens))
     points = [
         p.xyz
         for _, p in sorted(reconstruction.points3D.items(), key=lambda item: item[0])

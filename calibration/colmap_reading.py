@@ -117,7 +117,7 @@ def _converted(found: Any, folder: Path, sizes: dict[str, int], parts: int) -> C
 def _registered(image: Any, lenses: Mapping[int, tuple[Pinhole, Lens]]) -> Registered:
     T = np.eye(4)
     T[:3] = image.cam_from_world().inverse().matrix()
-    return Registered(image.name, str(image.camera_id), T, *lenses[image.camera_id], image.num_points3D)
+    return Registered(image.name, str(image.camera_id), T, *lenses[image.camera_id])
 
 
 def _found_camera(number: int, camera: Any, lens: tuple[Pinhole, Lens], count: int) -> FoundCamera:

@@ -84,7 +84,6 @@ class Registered:
         T_world_from_camera: Pose ``[4, 4]`` in the model's own world and scale, OpenCV axes.
         pinhole: Intrinsics.
         lens: Distortion.
-        observations: Number of points of the model that it sees.
     """
 
     name: str
@@ -92,7 +91,6 @@ class Registered:
     T_world_from_camera: Numbers
     pinhole: Pinhole
     lens: Lens
-    observations: int
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from advnerf_core.geometry import Array, Pinhole, invert_transform, make_transform
 from calibration.degeneracy import DegenerateDataError, PoorFitError
-from calibration.print_markers import LEAST_MARKERS, Marker
+from calibration.print_markers import LEAST_MARKERS
 from calibration.print_model import CORRELATED, LEAST_NOISE_PX
 from calibration.print_pose import MOST_ANGLE_RAD, MOST_SHARE, some_pose
 
@@ -26,11 +26,11 @@ class PrintView:
     """One picture of a print.
 
     Attributes:
-        markers: Markers by number.
+        markers: Corners ``[4, 2]`` of its markers by number [px].
         T_world_from_camera: Pose ``[4, 4]`` of the camera.
     """
 
-    markers: Mapping[int, Marker]
+    markers: Mapping[int, Array]
     T_world_from_camera: Array
 
 
@@ -123,7 +123,7 @@ class _Problem:
         index = {number: k for k, number in enumerate(self.numbers)}
         pairs = [(view, number) for view in views for number in view.markers]
         self._which = np.array([index[number] for _, number in pairs])
-        self._pixels = np.stack([view.markers[number].pixels for view, number in pairs])
+        self._pixels = np.stack([view.markers[number] for view, number in pairs])
         cameras = np.stack([invert_transform(view.T_world_from_camera) for view, _ in pairs])
         self._R, self._t = cameras[:, :3, :3], cameras[:, :3, 3]
         self._points = np.stack([corners_m[number] for number in self.numbers])
@@ -167,4 +167,4 @@ def _starts(views: Sequence[PrintView], corners_m: Mapping[int, Array], pinhole:
 
 
 def _pixels(view: PrintView) -> Array:
-    return np.concatenate([each.pixels for each in view.markers.values()])
+    return np.concatenate(list(view.markers.values()))

@@ -7,7 +7,6 @@ light, a line is fitted in undistorted coordinates, and corners are where lines 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -32,21 +31,6 @@ _SHARP_PX = 3.0
 _LARGE_PX = 4_000_000
 
 
-@dataclass(frozen=True, eq=False)
-class Marker:
-    """One marker in a photograph.
-
-    Attributes:
-        pixels: Corners ``[4, 2]`` in the undistorted photograph, pixel centres at +0.5 [px].
-        cell_px: Side of one of its cells [px].
-        blur_px: Standard deviation of the blur of its edges [px].
-    """
-
-    pixels: Array
-    cell_px: float
-    blur_px: float
-
-
 def linear(rgb: ArrayLike) -> Array:
     """Linear light in 0..1 of sRGB colours in 0..255."""
     share = np.asarray(rgb, np.float64) / 255.0
@@ -55,8 +39,8 @@ def linear(rgb: ArrayLike) -> Array:
 
 def find_markers(
     rgb: Rgb, lens: Intrinsics, wanted: Mapping[int, Array], what: str = "the print"
-) -> dict[int, Marker]:
-    """The wanted markers of a photograph by number; possibly none.
+) -> dict[int, Array]:
+    """Corners ``[4, 2]`` of a photograph's wanted markers by number, undistorted, pixel centres at +0.5 [px]; possibly none.
 
     Args:
         rgb: The photograph ``[H, W, 3]``, as the lens draws it.
@@ -84,10 +68,10 @@ def find_markers(
             )
         rough = (pixels.reshape(4, 2).astype(np.float64) + 0.5) / times - 0.5
         marker = _located(light, lens, rough)
-        if isinstance(marker, Marker):
-            located[number] = marker
-        else:
+        if isinstance(marker, str):
             poor.append(marker)
+        else:
+            located[number] = marker
     if poor and len(located) < LEAST_MARKERS:
         raise DegenerateDataError(
             f"expected at least {LEAST_MARKERS} sharp markers of {what}, got {len(located)}, and {len(poor)} of which {poor[0]}"
@@ -122,7 +106,8 @@ def why_none(rgb: Rgb) -> str:
     return "the print is not in view, is too small, is covered, or belongs to another .print.json"
 
 
-def _located(light: NDArray[np.float32], lens: Intrinsics, rough: Array) -> Marker | str:
+def _located(light: NDArray[np.float32], lens: Intrinsics, rough: Array) -> Array | str:
+    """Corners ``[4, 2]`` of a marker, or why they cannot be told."""
     cell_px = float(np.linalg.norm(rough - np.roll(rough, -1, axis=0), axis=1).min()) / CELLS
     if cell_px < _LEAST_CELL_PX:
         return (
@@ -139,7 +124,7 @@ def _located(light: NDArray[np.float32], lens: Intrinsics, rough: Array) -> Mark
     if blur_px > _MOST_BLUR_CELLS * cell_px:
         return f"edges are blurred by {blur_px:.1f} px at cells of {cell_px:.1f} px: it is out of focus, or the camera moved"
     corners = [_meet(one, other) for one, other in zip(np.roll(lines, 1, axis=0), lines, strict=True)]
-    return Marker(np.array(corners), cell_px, blur_px)
+    return np.array(corners)
 
 
 def undistorted(pixels: Array, lens: Intrinsics) -> Array:

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from advnerf_core.geometry import Array, Pinhole, make_transform
-from calibration.print_markers import Marker
 
 # Places of the parameters: pose (rotation vector, translation), growth of the black, logarithm of the aspect, bend.
 POSE, GROWTH, ASPECT, BEND = slice(0, 6), 6, 7, slice(8, 11)
@@ -66,16 +65,16 @@ class PrintFit:
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
 
-def corner_errors(markers: Mapping[int, Marker], corners_m: Mapping[int, Array], pinhole: Pinhole) -> Errors:
+def corner_errors(markers: Mapping[int, Array], corners_m: Mapping[int, Array], pinhole: Pinhole) -> Errors:
     """Errors of the corners of seen markers over the parameters.
 
     Args:
-        markers: Markers in the photograph by number.
+        markers: Corners ``[4, 2]`` of the markers in the photograph by number [px].
         corners_m: Nominal corners ``[4, 3]`` of all markers of the print [m].
         pinhole: Intrinsics of the undistorted photograph.
     """
     points = np.stack([corners_m[number] for number in markers])
-    pixels = np.stack([each.pixels for each in markers.values()])
+    pixels = np.stack(list(markers.values()))
     middles, half_m = points.mean(axis=1, keepdims=True), half_side(corners_m)
 
     def errors(p: Array) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import Array, Pinhole, invert_transform, make_transform
 from calibration.degeneracy import DegenerateDataError, PoorFitError
-from calibration.print_markers import LEAST_MARKERS, Marker
+from calibration.print_markers import LEAST_MARKERS
 from calibration.print_model import (
     ASPECT,
     BEND,
@@ -34,8 +34,8 @@ from calibration.print_model import (
     parameters,
 )
 
-Seen = tuple[Mapping[int, Marker], Mapping[int, Array]]
-"""Markers in the photograph, and corners ``[4, 3]`` of all markers [m], by number."""
+Seen = tuple[Mapping[int, Array], Mapping[int, Array]]
+"""Corners ``[4, 2]`` of markers in the photograph [px], and ``[4, 3]`` of all markers [m], by number."""
 
 MOST_ANGLE_RAD, MOST_SHARE = np.radians(0.5), 0.005
 _AMBIGUOUS = 25.0  # difference of the sums of squares of two tilts, in variances
@@ -87,12 +87,12 @@ class PrintPose:
 
 
 def fit_print(
-    markers: Mapping[int, Marker], corners_m: Mapping[int, Array], pinhole: Pinhole, card: Seen | None = None
+    markers: Mapping[int, Array], corners_m: Mapping[int, Array], pinhole: Pinhole, card: Seen | None = None
 ) -> PrintPose:
     """Fit the pose of a nearly flat print.
 
     Args:
-        markers: Markers in the photograph by number.
+        markers: Corners ``[4, 2]`` of the markers in the photograph by number [px].
         corners_m: Nominal corners ``[4, 3]`` of all markers of the print [m].
         pinhole: Intrinsics of the undistorted photograph.
         card: A card of true size in the plane of the print.
@@ -116,7 +116,7 @@ def fit_print(
                 ".print.json, and the right lens?"
             )
     fit = _with_aspect(fit, (kept, corners_m), pinhole)
-    extent_px = float(np.ptp(np.concatenate([each.pixels for each in kept.values()]), axis=0).max())
+    extent_px = float(np.ptp(np.concatenate(list(kept.values())), axis=0).max())
     bend, bend_sd = _require_flat(fit, extent_px, kept, corners_m)
     scale, scale_sd = None, 0.0
     if card is not None:
@@ -141,7 +141,7 @@ def fit_print(
     )
 
 
-def some_pose(markers: Mapping[int, Marker], corners_m: Mapping[int, Array], pinhole: Pinhole) -> Array:
+def some_pose(markers: Mapping[int, Array], corners_m: Mapping[int, Array], pinhole: Pinhole) -> Array:
     """The pose ``[4, 4]`` that explains the corners best, in nominal units, whatever else explains them."""
     return _fits((markers, corners_m), pinhole)[0].transform
 
@@ -157,7 +157,7 @@ def _fits(seen: Seen, pinhole: Pinhole) -> list[PrintFit]:
     """All poses that explain the corners, the best first."""
     markers, corners_m = seen
     points = np.concatenate([corners_m[number] for number in markers])
-    pixels = np.concatenate([each.pixels for each in markers.values()])
+    pixels = np.concatenate(list(markers.values()))
     flat = np.ascontiguousarray(points[:, [1, 2, 0]])
     _, turns, moves, _ = cv2.solvePnPGeneric(flat, pixels, pinhole.matrix, None, flags=cv2.SOLVEPNP_IPPE)
     starts = [
@@ -205,7 +205,7 @@ def _with_aspect(fit: PrintFit, seen: Seen, pinhole: Pinhole) -> PrintFit:
 
 
 def _require_flat(
-    fit: PrintFit, extent_px: float, markers: Mapping[int, Marker], corners_m: Mapping[int, Array]
+    fit: PrintFit, extent_px: float, markers: Mapping[int, Array], corners_m: Mapping[int, Array]
 ) -> tuple[float, float]:
     """Root mean square bend at the markers and its standard deviation, in nominal metres; an error if it is too large."""
     most_px = max(_MOST_RMS_PX, _MOST_RMS_SHARE * extent_px)
@@ -262,7 +262,7 @@ def _with_card(seen: Seen, card: Seen, pinhole: Pinhole) -> Errors:
     """Errors with a card in the print's plane, over five more parameters: its place y, z, its turn, the logarithm of its size, its growth."""
     own = corner_errors(*seen, pinhole)
     points = np.stack([card[1][number] for number in card[0]])
-    pixels = np.stack([each.pixels for each in card[0].values()])
+    pixels = np.stack(list(card[0].values()))
     middles = points.mean(axis=1, keepdims=True)
 
     def errors(p: Array) -> Array:

@@ -104,7 +104,7 @@ def _image(row: Array, file: Path, where: str) -> Registered:
     T = pose_of(np.stack([right, down, -back, position], axis=1), where)
     height, width, focal = (float(each) for each in pose[:, 4])
     pinhole = pinhole_of(width, height, (focal, focal, 0.5 * width, 0.5 * height), where)
-    return Registered(file.name, "camera", T, pinhole, Lens(), 0)
+    return Registered(file.name, "camera", T, pinhole, Lens())
 
 
 def _reached(image: Registered, bounds: Array) -> Array:

@@ -54,7 +54,7 @@ def read(path: Path, options: ScanOptions) -> Scan:
         name = _name(frame.path, listed.file.parent if listed.file else path, pictures)
         lens = lens_of(frame.pinhole, frame.lens, str(frame.path))
         camera = frame.camera_id or "camera"
-        found.append(Registered(name, camera, frame.T_world_from_camera, frame.pinhole, lens, 0))
+        found.append(Registered(name, camera, frame.T_world_from_camera, frame.pinhole, lens))
         pictures[name] = _picture(name, frame)
     left_out = [LeftOut(each.name, f"{each} is not there") for each in listed.missing]
     content = read_json(listed.file) if listed.file else {}

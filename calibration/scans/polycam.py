@@ -87,7 +87,7 @@ def _keyframe(file: Path, image: Path, corrected: bool, digits: int) -> tuple[Re
     pinhole, edited = whole, None
     if corrected:
         pinhole, edited = _without_border(whole), partial(_pixels_without_border, image)
-    one = Registered(image.name, "phone", T @ OPENGL_FROM_OPENCV, pinhole, Lens(), 0)
+    one = Registered(image.name, "phone", T @ OPENGL_FROM_OPENCV, pinhole, Lens())
     name = f"{image.stem.zfill(digits)}{image.suffix}"  # in the order of time
     picture = Picture(name, partial(read_bytes, image), whole.width, whole.height, edited)
     return one, picture, whole

@@ -77,7 +77,7 @@ def _image(values: dict[str, Any], index: int, name: str, where: str) -> Registe
     where = f"{where}: poses: {index}"
     pinhole = pinhole_of(values["w"], values["h"], _intrinsics(values, index, where), where)
     return Registered(
-        name, "phone", _pose(values["poses"][index], where) @ OPENGL_FROM_OPENCV, pinhole, Lens(), 0
+        name, "phone", _pose(values["poses"][index], where) @ OPENGL_FROM_OPENCV, pinhole, Lens()
     )
 
 

@@ -84,7 +84,7 @@ def place_images(
     for index in spread(len(with_pose), options.most or MOST_OF_RECORDING):
         image, T = with_pose[index]
         pinhole, lens = intrinsics(image.file)
-        placed.images.append(Registered(image.name, camera_id, T @ T_body_from_camera, pinhole, lens, 0))
+        placed.images.append(Registered(image.name, camera_id, T @ T_body_from_camera, pinhole, lens))
         placed.pictures[image.name] = Picture(
             image.name, partial(read_bytes, image.file), pinhole.width, pinhole.height
         )

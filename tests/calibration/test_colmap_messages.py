@@ -36,9 +36,7 @@ def test_a_job_arrives_as_it_was_sent(tmp_path):
 
 def test_a_model_arrives_to_the_bit():
     rng = np.random.default_rng(0)
-    images = tuple(
-        Registered(f"{k}.jpg", "phone", rng.normal(size=(4, 4)), PINHOLE, LENS, k) for k in range(3)
-    )
+    images = tuple(Registered(f"{k}.jpg", "phone", rng.normal(size=(4, 4)), PINHOLE, LENS) for k in range(3))
     camera = FoundCamera("phone", 3, "RADIAL", "5 images", PINHOLE, LENS, None)
     model = Model(
         images, (LeftOut("d.jpg", "no matches"),), rng.normal(size=(50, 3)) * 1e7, 0.31, 2, (camera,)
@@ -48,12 +46,11 @@ def test_a_model_arrives_to_the_bit():
     assert got.points.tobytes() == model.points.tobytes()
     for a, b in zip(got.images, images, strict=True):
         assert a.T_world_from_camera.tobytes() == b.T_world_from_camera.tobytes()
-        assert (a.name, a.camera_id, a.pinhole, a.lens, a.observations) == (
+        assert (a.name, a.camera_id, a.pinhole, a.lens) == (
             b.name,
             b.camera_id,
             PINHOLE,
             LENS,
-            b.observations,
         )
     assert (got.left_out, got.cameras, got.parts, got.reprojection_error_px) == (
         model.left_out,

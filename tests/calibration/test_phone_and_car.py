@@ -41,7 +41,7 @@ def model_of(phone, car, noise_m=0.0, seed=0):
         for index, pose in enumerate(INVERSE.poses(poses)):
             pose[:3, 3] += rng.normal(0.0, noise_m / 1.8, 3)
             images.append(
-                Registered(f"{name}/{index}", name, pose, Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0), Lens(), 80)
+                Registered(f"{name}/{index}", name, pose, Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0), Lens())
             )
     points = INVERSE.points(np.array([[1.0, 2.0, 0.5], [0.0, 0.0, 2.0]]))
     return Model(tuple(images), (), points, 0.5, 1)

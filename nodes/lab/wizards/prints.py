@@ -21,7 +21,7 @@ from advnerf_core.plugins import unknown
 from calibration.degeneracy import DegenerateDataError
 from calibration.print_colour import PrintColours, in_picture, picture_points, print_colours
 from calibration.print_drive import PrintView, place_print
-from calibration.print_markers import Marker, find_markers, why_none
+from calibration.print_markers import find_markers, why_none
 from calibration.print_measurement import (
     CARD,
     DISTANCE,
@@ -257,7 +257,7 @@ def _with_colours(
     return MeasuredPrint(replace(found, colours=colours.error), colours, by_car)
 
 
-def _seen(rgb: Rgb, lens: Intrinsics, wanted: Mapping[int, Array]) -> dict[int, Marker]:
+def _seen(rgb: Rgb, lens: Intrinsics, wanted: Mapping[int, Array]) -> dict[int, Array]:
     try:
         return find_markers(rgb, lens, wanted)
     except DegenerateDataError:  # of a drive, blurred and distant pictures are left out

@@ -26,7 +26,7 @@ def walk(count=40):
 
 def model_of(poses):
     images = [
-        Registered(f"{k}", "phone", pose, Pinhole(4, 3, 3.0, 3.0, 2.0, 1.5), Lens(), 9)
+        Registered(f"{k}", "phone", pose, Pinhole(4, 3, 3.0, 3.0, 2.0, 1.5), Lens())
         for k, pose in enumerate(poses)
     ]
     return Model(tuple(images), (), np.array([[1.0, 2.0, 3.0], [2.0, 2.0, 3.0], [9.0, 2.0, 3.0]]), 0.5, 1)
