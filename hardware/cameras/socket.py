@@ -20,7 +20,6 @@ class SocketCamera(Camera):
     Each frame is requested, so that no frame waits in the socket while the reader is busy.
 
     Args:
-        path: Path of the socket.
         stall_s: Longest time for receiving a frame [s].
     """
 
@@ -58,13 +57,6 @@ class SocketCamera(Camera):
         if self._socket is not None:
             self._socket.close()
             self._socket, self._asked = None, False
-
-    def __enter__(self) -> SocketCamera:
-        self.open()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _ask(self) -> None:
         if self._socket is None:

@@ -64,12 +64,6 @@ class MonitorPort:
         self._thread.join(timeout=2.0)
         self.path.unlink(missing_ok=True)
 
-    def __enter__(self) -> MonitorPort:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
     def _accept(self) -> None:
         while True:
             try:

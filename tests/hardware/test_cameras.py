@@ -14,6 +14,7 @@ from hardware.cameras.interface import Frame
 from hardware.cameras.socket import SocketCamera
 from hardware.emulators.frame_server import FrameServer
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost, LinkTimeout, ProtocolError
+from tests.support.sockets import connected
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
@@ -36,7 +37,7 @@ def test_head_round_trip():
 
 
 def test_frames_come_through_with_their_stamps(tmp_path):
-    with FrameServer(tmp_path / "frames") as server, SocketCamera(tmp_path / "frames") as camera:
+    with FrameServer(tmp_path / "frames") as server, connected(tmp_path / "frames") as camera:
         wait_for(lambda: server.clients == 1, "the client")
         assert camera.read(timeout_s=0.02) is None
         for sequence in range(5):
@@ -49,7 +50,7 @@ def test_frames_come_through_with_their_stamps(tmp_path):
 
 @pytest.mark.parametrize("gave_up_before", [False, True])
 def test_a_reader_that_slept_gets_the_newest_and_no_backlog(tmp_path, gave_up_before):
-    with FrameServer(tmp_path / "frames") as server, SocketCamera(tmp_path / "frames") as camera:
+    with FrameServer(tmp_path / "frames") as server, connected(tmp_path / "frames") as camera:
         wait_for(lambda: server.clients == 1, "the client")
         if gave_up_before:
             assert camera.read(timeout_s=0.01) is None
@@ -92,7 +93,7 @@ def test_a_dead_socket_file_is_replaced(tmp_path):
     dead = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     dead.bind(str(tmp_path / "frames"))
     dead.close()
-    with FrameServer(tmp_path / "frames"), SocketCamera(tmp_path / "frames"):
+    with FrameServer(tmp_path / "frames"), connected(tmp_path / "frames"):
         pass
 
 

@@ -2,6 +2,7 @@ import hashlib
 import os
 import subprocess
 import sys
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -65,7 +66,7 @@ def test_a_driver_that_gives_another_size_is_refused():
 
 
 def test_the_twins_monitor_says_its_size_and_shows_what_it_is_sent(tmp_path):
-    with MonitorPort(tmp_path / "monitor", SIZE_M, (64, 36)) as port:
+    with closing(MonitorPort(tmp_path / "monitor", SIZE_M, (64, 36))) as port:
         display = TwinDisplay(tmp_path / "monitor")
         assert display.edid.size_mm == (598.0, 336.0)
         assert display.size_px == (64, 36)
@@ -105,7 +106,7 @@ def test_a_second_source_is_refused_and_a_lost_twin_noticed(tmp_path, monkeypatc
 
 
 def test_a_picture_cut_off_in_the_middle_is_not_shown(tmp_path):
-    with MonitorPort(tmp_path / "monitor", SIZE_M, (64, 36)) as port:
+    with closing(MonitorPort(tmp_path / "monitor", SIZE_M, (64, 36))) as port:
         display = TwinDisplay(tmp_path / "monitor")
         display._socket.sendall(b"S" + bytes(1000))
         display.close()

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import VehicleState, yaw_of
-from hardware.cameras.socket import SocketCamera
 from hardware.emulators.live import LiveLab, LiveLabConfig, PoseHistory
 from hardware.emulators.vicon_emulator import ViconEmulatorConfig
 from hardware.errors import HardwareError
@@ -16,6 +15,7 @@ from hardware.motor.limits import DriveLimits, VehicleGains
 from hardware.motor.vesc import Vesc
 from hardware.worlds.lab.lab import Lab
 from tests.support.faulty_devices import OCCLUSION_FORMS, FaultyLab, FaultyViconFrames
+from tests.support.sockets import connected
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
@@ -83,7 +83,7 @@ def test_vicon_rate_noise_and_truth(lab, receiver):
 
 
 def test_frames_come_at_their_rate_with_true_stamps(lab):
-    with SocketCamera(lab.frames_path) as camera:
+    with connected(lab.frames_path) as camera:
         frames = [camera.read(timeout_s=60.0) for _ in range(6)]
         arrived_ns = time.time_ns()
     stamps = np.array([f.stamp_realtime_ns for f in frames])
@@ -102,7 +102,7 @@ def test_driving_moves_what_is_measured_and_seen(lab, receiver):
     lab.place(-1.1, -2.0, 0.0)
     with (
         Vesc(str(lab.vesc_port), VehicleGains(), DriveLimits()) as vesc,
-        SocketCamera(lab.frames_path) as camera,
+        connected(lab.frames_path) as camera,
     ):
         assert vesc.identify().hardware_name == "TWIN"
         before = camera.read(timeout_s=60.0)
@@ -149,7 +149,7 @@ def test_a_frozen_camera_gives_no_new_stamp(lab, fault):
                 stamps.append(frame.stamp_realtime_ns)
         return stamps
 
-    with SocketCamera(lab.frames_path) as camera:
+    with connected(lab.frames_path) as camera:
         before = newest_stamps(camera, 0.4, 2)
         lab.freeze_camera(fault)
         newest_stamps(camera, 0.2)  # what was on its way
@@ -171,7 +171,7 @@ def test_a_latency_is_shorter_than_the_cameras_period():
 def test_its_camera_may_have_the_flaws_of_a_real_one(tmp_path):
     config = LiveLabConfig(camera_effects={"read_noise": 0.02, "lost": 0.3}, camera_latency_s=0.09)
     frames, ages_s = [], []
-    with LiveLab(config, tmp_path) as lab, SocketCamera(lab.frames_path) as camera:
+    with LiveLab(config, tmp_path) as lab, connected(lab.frames_path) as camera:
         for _ in range(12):
             frames.append(camera.read(60.0))
             ages_s.append(time.time() - frames[-1].stamp_realtime_ns / 1e9)

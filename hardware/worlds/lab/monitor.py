@@ -55,11 +55,6 @@ class ScreenOptics:
         total = np.maximum(light + np.asarray(self._config.glare, np.float32), np.float32(0.0))
         return textures.to_uint8(np.asarray(cv2.pow(total, 1.0 / self._config.response), np.float32))
 
-    def cos_angle(self, position_m: Array) -> float:
-        """Cosine of the angle at which the screen's middle is seen from a place; 0 from behind."""
-        to_camera = transform_points(self._T_face_from_world, position_m)
-        return float(max(to_camera[0] / max(np.linalg.norm(to_camera), 1e-9), 0.0))
-
     def _gain(self, position_m: Array) -> NDArray[np.float32]:
         to_camera = transform_points(self._T_face_from_world, position_m) - self._places
         cosine = to_camera[..., 0] / np.maximum(np.linalg.norm(to_camera, axis=-1), 1e-9)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import weakref
-from types import TracebackType
 from typing import Any
 
 import cv2
@@ -117,14 +116,6 @@ class Renderer:
         """Free the OpenGL resources; safe to call twice."""
         atexit.unregister(self._free)
         self._free()
-
-    def __enter__(self) -> Renderer:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _update_scene(self, hidden_groups: tuple[int, ...]) -> None:
         mujoco = self._mujoco

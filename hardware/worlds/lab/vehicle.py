@@ -111,16 +111,6 @@ class TwinVehicle:
         """Electrical rpm that the motor controller measures."""
         return self._speed * self.params.true_erpm_gain
 
-    @property
-    def servo(self) -> float:
-        """Current servo position, 0..1."""
-        return self._servo
-
-    @property
-    def body(self) -> Footprint:
-        """Footprint of the body."""
-        return self.body_at(self._x, self._y, self._yaw)
-
     def touches(self, x_m: float, y_m: float, yaw_rad: float) -> str:
         """Name of the obstacle that the body touches with the rear axle at this pose; empty if nothing is near."""
         return touched_by(self.body_at(x_m, y_m, yaw_rad), self._obstacles, self._room_half_m, "wall")
