@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from hardware.worlds.carla import CarlaConfig
+from hardware.worlds import CarlaConfig
 
 ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs" / "carla.md").read_text(encoding="utf-8")

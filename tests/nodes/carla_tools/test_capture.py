@@ -7,8 +7,9 @@ import pytest
 
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import transform_points
-from hardware.worlds.carla import CarlaConfig, CarlaScene, CarlaUnreachable
+from hardware.worlds import CarlaConfig, CarlaScene
 from hardware.worlds.carla.config import JunctionConfig
+from hardware.worlds.carla.errors import CarlaUnreachable
 from hardware.worlds.carla.frames import SceneFrame
 from hardware.worlds.carla.junction import find_drives
 from hardware.worlds.carla.photos import photo_poses

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hardware.worlds.carla import CarlaConfig
+from hardware.worlds import CarlaConfig
 from nodes.lab.carla.check import check_server
 
 

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from hardware.worlds.carla import CarlaMapError
+from hardware.worlds.carla.errors import CarlaMapError
 from nodes.cli.carla import app
 from nodes.runtime.errors import ConfigError
 

@@ -9,7 +9,7 @@ from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Surrogate
-from hardware.worlds.carla import CarlaConfig, CarlaScene
+from hardware.worlds import CarlaConfig, CarlaScene
 from nodes.experiment.show.deployed import DressedScene, SelfDriving, drive_deployed
 from nodes.lab.worlds.expert_drive import as_path, drive_expert, lane_expert
 
