@@ -15,9 +15,8 @@ _STRAIGHT_M = 2e-3
 _STRAIGHT_RAD = 1e-3
 _MAX_RADIUS_M = 1e5
 _CLOSING_RADIUS_M = 1e8  # anything straighter than this misses its end by less than 1e-7 m over some metres
-_MAX_TURN_RAD = (
-    0.75 * math.pi
-)  # no lane turns this far in one piece; if one seems to, its points do not belong together
+# No lane turns this far in one piece; if one seems to, its points do not belong together.
+_MAX_TURN_RAD = 0.75 * math.pi
 
 
 def fit_lines_and_arcs(poses: ArrayLike, tolerance_m: float = 0.02) -> tuple[Segment, ...]:
@@ -171,9 +170,8 @@ def _biarc(along: float, aside: float, turn: float, max_radius_m: float = _MAX_R
     # a d^2 + b d - c = 0, its positive root in the form that also holds for a = 0.
     d = 2.0 * c / (b + math.sqrt(b * b + 4.0 * a * c))
     joint = 0.5 * (v + d * (t0 - t1))
-    middle = 2.0 * math.atan2(
-        joint[1], joint[0]
-    )  # heading where the arcs meet: a chord is half-way through its turn
+    # Heading where the arcs meet: a chord is half-way through its turn.
+    middle = 2.0 * math.atan2(joint[1], joint[0])
     return [
         *_arc(joint, middle, max_radius_m),
         *_arc(v - joint, float(wrap_angle(turn - middle)), max_radius_m),

@@ -8,9 +8,8 @@ from collections.abc import Callable
 from advnerf_core.geometry import VehicleState
 from hardware.worlds.junction.config import DubinsConfig
 
-SUBSTEP_S = (
-    0.005  # 3 cm at 6 m/s, 1/24 of the lag; between substeps the turn rate's mean is integrated exactly
-)
+# 3 cm at 6 m/s, 1/24 of the lag; between substeps the turn rate's mean is integrated exactly.
+SUBSTEP_S = 0.005
 
 
 class DubinsCar:
@@ -68,9 +67,8 @@ class DubinsCar:
         lag, before = self.config.turn_rate_lag_s, self.turn_rate_radps
         if lag > 0.0:
             decay = math.exp(-dt_s / lag)
-            turn = target_radps * dt_s + (before - target_radps) * lag * (
-                1.0 - decay
-            )  # the lag's exact integral
+            # The lag's exact integral.
+            turn = target_radps * dt_s + (before - target_radps) * lag * (1.0 - decay)
             self.turn_rate_radps = target_radps + (before - target_radps) * decay
         else:
             turn = target_radps * dt_s

@@ -41,9 +41,8 @@ def build_model(config: IntersectionConfig) -> Any:
     mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     spec.visual.headlight.active = 0
-    spec.visual.quality.offsamples = (
-        0  # the renderer averages a larger image instead, which also filters textures
-    )
+    # The renderer averages a larger image instead, which also filters textures.
+    spec.visual.quality.offsamples = 0
     surfaces, solids, plans = _painted(config.road)
     # Drawn front to back: first what hides others (trees, houses), last what is hidden (the road, the sky).
     for name in ("swatches", "pavement", "garden"):

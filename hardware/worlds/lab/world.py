@@ -53,9 +53,8 @@ def compose_room(config: LabConfig) -> Any:
     mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     spec.visual.headlight.active = 0
-    spec.visual.quality.offsamples = (
-        0  # the renderer averages a larger image instead, which also filters textures
-    )
+    # The renderer averages a larger image instead, which also filters textures.
+    spec.visual.quality.offsamples = 0
     _add_lights(mujoco, spec)
     surfaces, tape = paint_room(config)
     for name, surface in surfaces.items():
