@@ -50,7 +50,7 @@ def measure(kind: str, changes: tuple[str, ...]) -> tuple[float, float]:
         for step in range(WARM_UP + STEPS):
             if step == WARM_UP:
                 assert world.server is not None
-                server = psutil.Process(world.server.pid)
+                server = psutil.Process(world.server.process.pid)
                 before = sum(server.cpu_times()[:2])
             began = time.perf_counter()
             world.step(0.0, description.car.speed_mps, 0.1)
