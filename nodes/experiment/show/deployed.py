@@ -6,9 +6,10 @@ only then is the image cropped and resized for the policy.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,29 +36,37 @@ from nodes.experiment.show.standing import clear
 _SUPERSAMPLE = 1
 
 
-class Dressed(Protocol):
-    """An attacked deployment scene, as the policy sees it."""
+class Dressed(ABC):
+    """An attacked deployment scene, as the policy sees it; here the scene renders every picture on request."""
 
     scene: World
     view: PolicyView
 
+    @abstractmethod
     def plain_theta(self) -> Tensor | None:
         """Parameters of the objects without an attack."""
 
-    def prepare(self, states: Array, /) -> Any:
+    def prepare(self, states: Array) -> Any:
         """Prepare everything of the policy's view from car states ``[B, 3]`` that does not depend on the attack; time does not pass."""
+        return np.asarray(states, dtype=np.float64)
 
-    def policy_images(self, frames: Any, theta: Tensor | None, /) -> NDArray[np.uint8]:
+    def policy_images(self, frames: Any, theta: Tensor | None) -> NDArray[np.uint8]:
         """Policy images ``[B, 66, 200, 3]`` of prepared views."""
+        return np.stack([self.view.image(self.camera_image(state, theta)) for state in frames])
 
-    def seen_now(self, theta: Tensor | None, /) -> NDArray[np.uint8]:
+    def seen_now(self, theta: Tensor | None) -> NDArray[np.uint8]:
         """Policy image ``[66, 200, 3]`` at the car's current pose."""
+        state = self.scene.state
+        return self.view.image(self.camera_image(np.array([state.x_m, state.y_m, state.yaw_rad]), theta))
 
-    def camera_image(self, state: Array, theta: Tensor | None, /) -> NDArray[np.uint8]:
+    @abstractmethod
+    def camera_image(self, state: Array, theta: Tensor | None) -> NDArray[np.uint8]:
         """The whole camera image ``[H, W, 3]`` from a car state ``[3]``."""
 
-    def paint(self, rgb: Rgb, state: Array, theta: Tensor, /) -> NDArray[np.uint8]:
-        """A camera image ``[H, W, 3]`` with the attack, from one without it from the same state ``[3]``."""
+    def paint(self, rgb: Rgb, state: Array, theta: Tensor) -> NDArray[np.uint8]:
+        """A camera image ``[H, W, 3]`` with the attack, from one without it from the same state ``[3]``; rendered again, as that image has no depth."""
+        del rgb
+        return self.camera_image(state, theta)
 
 
 def seen_in(scene: Dressed) -> Callable[[Array], Show]:
@@ -70,7 +79,7 @@ def seen_in(scene: Dressed) -> Callable[[Array], Show]:
     return seen
 
 
-class DressedScene:
+class DressedScene(Dressed):
     """A deployment scene with the attack's objects in it, as the policy sees it.
 
     Args:
@@ -109,18 +118,18 @@ class DressedScene:
         return self._window.plain_theta()
 
     def prepare(self, states: Array) -> PoseBatch:
-        """Prepare everything of the policy's window from car states ``[B, 3]`` that does not depend on colours; time does not pass."""
+        """See `Dressed.prepare`."""
         return self._window.prepare(
             self._window.camera_poses(torch.from_numpy(np.asarray(states, dtype=np.float64)))
         )
 
     def policy_images(self, frames: PoseBatch, theta: Tensor | None) -> NDArray[np.uint8]:
-        """Policy images ``[B, 66, 200, 3]`` of prepared windows."""
+        """See `Dressed.policy_images`."""
         shown = self._window.plain_theta() if theta is None and self._window.objects else theta
         return np.stack([self._resized(as_uint8(image)) for image in frames.render(shown).images])
 
     def seen_now(self, theta: Tensor | None) -> NDArray[np.uint8]:
-        """Policy image ``[66, 200, 3]`` at the car's current pose."""
+        """See `Dressed.seen_now`."""
         clear(self.scene)
         rgb, depth_m = require_depth(self.scene.observe())
         window = self.view.window
@@ -132,14 +141,9 @@ class DressedScene:
         return self._resized(as_uint8(image[0]))
 
     def camera_image(self, state: Array, theta: Tensor | None) -> NDArray[np.uint8]:
-        """The whole camera image ``[H, W, 3]`` from a car state ``[3]``, for films."""
+        """See `Dressed.camera_image`."""
         poses = self._whole.camera_poses(torch.from_numpy(np.asarray(state, dtype=np.float64))[None])
         return as_uint8(self._whole.render(poses, theta).images[0])
-
-    def paint(self, rgb: Rgb, state: Array, theta: Tensor) -> NDArray[np.uint8]:
-        """The whole camera image with the objects in these colours; see `Dressed.paint`."""
-        del rgb  # it has no depth
-        return self.camera_image(state, theta)
 
     def _resized(self, window: NDArray[np.uint8]) -> NDArray[np.uint8]:
         resized = cv2.resize(window, (self.view.width, self.view.height), interpolation=cv2.INTER_AREA)

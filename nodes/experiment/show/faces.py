@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from torch import Tensor
 
@@ -11,7 +9,7 @@ from advnerf_core.attack.artifact import TEXTURE_PX, face_texture
 from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.attack.spaces.space import FaceMount, FaceSpace, NamedObject
 from advnerf_core.display import DisplayModel
-from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
+from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, face_corners_in_object
 from advnerf_core.geometry import Array, invert_transform, make_transform, planar_pose, planar_poses
 from advnerf_core.plugins import unknown
 from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
@@ -20,6 +18,7 @@ from calibration.schema import load_calibration
 from hardware.worlds.world import Panel, Rgb, World
 from nodes.experiment.plan.carriers import FaceCarrier, ScreenConfig
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.screen import cos_angle, face_picture, plain_picture, screens_of
 from nodes.runtime.errors import ConfigError
@@ -64,13 +63,6 @@ def face_object(experiment: Experiment) -> VoxelGridObject:
     return cube_face_object(panel.square_m, wanted.resolution, wanted.plain_rgb, pose)
 
 
-def corners_on(panel: Panel) -> Array:
-    """Corners ``[4, 3]`` of the face in its panel's frame: top left, top right, bottom right, bottom left for a viewer [m]."""
-    half = 0.5 * panel.square_m
-    # A viewer of the panel looks along its -x with z up, so left is its -y.
-    return np.array([[0.0, -half, half], [0.0, half, half], [0.0, half, -half], [0.0, -half, -half]])
-
-
 def display_of(experiment: Experiment) -> DisplayModel:
     """Optics of the screen for the driving camera, measured in the capture stage."""
     return load_calibration(DisplayCalibration, experiment.calibration_folder / DISPLAY).display
@@ -90,7 +82,7 @@ def face_space(
     surrogate = Surrogate(
         background or load_background(experiment), experiment.view.pinhole, experiment.mount, [field]
     )
-    mount = FaceMount(wanted.panel, (panel.square_m, panel.square_m), corners_on(panel))
+    mount = FaceMount(wanted.panel, (panel.square_m, panel.square_m), face_corners_in_object(panel.square_m))
     named = NamedObject("face", field.sha256)
     if not isinstance(wanted, ScreenConfig) or (not wanted.display_model if ideal is None else ideal):
         return FaceSpace(surrogate, [named], mount=mount)
@@ -118,8 +110,8 @@ def plain_screen(experiment: Experiment) -> Rgb:
     return plain_picture(panel_of(experiment), wanted_face(experiment).plain_rgb)
 
 
-class PaintedScene:
-    """A deployment scene with a face on its panel, as the policy sees it: `nodes.experiment.show.deployed.Dressed` for a face.
+class PaintedScene(Dressed):
+    """A deployment scene with a face on its panel, as the policy sees it.
 
     A board's face is drawn by the same code as live; a screen shows it, and the scene is rendered again, as no projection models its optics.
 
@@ -141,28 +133,15 @@ class PaintedScene:
         """None: without an attack nothing is drawn."""
         return
 
-    def prepare(self, states: Array) -> Array:
-        """The states ``[B, 3]`` themselves: the scene renders each picture on request."""
-        return np.asarray(states, dtype=np.float64)
-
-    def policy_images(self, frames: Any, theta: Tensor | None) -> Rgb:
-        """Policy images ``[B, 66, 200, 3]`` from car states."""
-        return np.stack([self.view.image(self.camera_image(state, theta)) for state in frames])
-
-    def seen_now(self, theta: Tensor | None) -> Rgb:
-        """Policy image ``[66, 200, 3]`` at the car's current pose."""
-        state = self.scene.state
-        return self.view.image(self.camera_image(np.array([state.x_m, state.y_m, state.yaw_rad]), theta))
-
     def camera_image(self, state: Array, theta: Tensor | None) -> Rgb:
-        """The whole camera image ``[H, W, 3]`` from a car state ``[3]``."""
+        """See `Dressed.camera_image`."""
         if theta is not None and self._plain is not None:
             return self._on_screen(state, theta)
         rgb = self._observed(state)
         return rgb if theta is None else self._on_board(rgb, state, theta)
 
     def paint(self, rgb: Rgb, state: Array, theta: Tensor) -> Rgb:
-        """A camera image ``[H, W, 3]`` with the face, from one without it from the same state ``[3]``."""
+        """See `Dressed.paint`; a board's face is drawn into the image."""
         return self._on_board(rgb, state, theta) if self._plain is None else self._on_screen(state, theta)
 
     def _observed(self, state: Array) -> Rgb:
@@ -170,7 +149,8 @@ class PaintedScene:
         return self.scene.observe_at(x_m, y_m, yaw_rad, depth=False)[0]
 
     def _on_board(self, rgb: Rgb, state: Array, theta: Tensor) -> Rgb:
-        overlay = FaceOverlay(self._texture(theta), corners_on(self._panel), self.view.camera)
+        corners = face_corners_in_object(self._panel.square_m)
+        overlay = FaceOverlay(self._texture(theta), corners, self.view.camera)
         T_camera_from_world = self._T_camera_from_car @ invert_transform(planar_pose(*map(float, state[:3])))
         return overlay.draw(rgb, T_camera_from_world @ self._panel.T_world_from_face)[0]
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.display import DisplayModel
+from advnerf_core.fields.voxel_grid import face_corners_in_object
 from advnerf_core.geometry import invert_transform, planar_pose, transform_points
 from calibration.display_colour import (
     DisplayCalibration,
@@ -92,8 +93,7 @@ def _poses(experiment: Experiment, world: World, thing: PlacedObject) -> list[Po
 
 def _region(experiment: Experiment, thing: PlacedObject, pose: Pose) -> NDArray[np.bool_]:
     """Pixels ``[H, W]`` of the driving camera well inside the panel."""
-    half = 0.5 * _INSIDE * thing.side_m
-    corners = np.array([[0.0, -half, half], [0.0, half, half], [0.0, half, -half], [0.0, -half, -half]])
+    corners = face_corners_in_object(_INSIDE * thing.side_m)
     T_camera_from_world = invert_transform(planar_pose(*pose) @ experiment.mount)
     pixels = (
         experiment.camera.project(transform_points(T_camera_from_world @ thing.T_world_from_face, corners))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -54,26 +54,8 @@ def stand_in(
     return NativeScene(scene, experiment.view, objects, surfaces)
 
 
-class _Thing(Protocol):
-    """An object of a world's own scene: a panel, or a mesh."""
-
-    @property
-    def is_mesh(self) -> bool:
-        """Whether it is a mesh."""
-
-    @property
-    def shape(self) -> bytes:
-        """All that it depends on except its colours."""
-
-    def texture(self, colours: Tensor) -> Rgb:
-        """Its texture ``[h, w, 3]`` in these colours."""
-
-    def put(self, name: str, texture: Rgb) -> None:
-        """Put it into the scene."""
-
-
-class NativeScene:
-    """A deployment scene whose own renderer shows the attacked objects: `nodes.experiment.show.deployed.Dressed`.
+class NativeScene(Dressed):
+    """A deployment scene whose own renderer shows the attacked objects.
 
     Args:
         scene: The open scene.
@@ -92,8 +74,7 @@ class NativeScene:
         objects: Sequence[ColouredObject],
         surfaces: Sequence[SurfaceMesh | None] = (),
     ) -> None:
-        self.scene: World = scene
-        self.view = view
+        self.scene, self.view = scene, view
         self._fields = tuple(objects)
         self._things = [
             _thing(scene, field, surface)
@@ -106,29 +87,16 @@ class NativeScene:
         """The objects' own colours."""
         return self._plain
 
-    def prepare(self, states: Array) -> Array:
-        """The states ``[B, 3]`` themselves: the world renders each picture on request."""
-        return np.asarray(states, dtype=np.float64)
-
-    def policy_images(self, frames: Any, theta: Tensor | None) -> Rgb:
-        """Policy images ``[B, 66, 200, 3]`` from car states."""
-        return np.stack([self.view.image(self.camera_image(state, theta)) for state in frames])
-
     def seen_now(self, theta: Tensor | None) -> Rgb:
-        """Policy image ``[66, 200, 3]`` at the car's current pose."""
+        """See `Dressed.seen_now`."""
         self._show(theta)
         return self.view.image(self.scene.observe(depth=False)[0])
 
     def camera_image(self, state: Array, theta: Tensor | None) -> Rgb:
-        """The whole camera image ``[H, W, 3]`` from a car state ``[3]``."""
+        """See `Dressed.camera_image`."""
         self._show(theta)
         x_m, y_m, yaw_rad = map(float, state[:3])
         return self.scene.observe_at(x_m, y_m, yaw_rad, depth=False)[0]
-
-    def paint(self, rgb: Rgb, state: Array, theta: Tensor) -> Rgb:
-        """The whole camera image with the objects in these colours; it is rendered again, as only the world models its light."""
-        del rgb
-        return self.camera_image(state, theta)
 
     def _show(self, theta: Tensor | None) -> None:
         """Make the world show the objects in these colours, in plain ones for None, unless it does already."""
@@ -164,16 +132,16 @@ class _Board:
 
     @property
     def shape(self) -> bytes:
-        """See `_Thing`."""
+        """All that it depends on except its colours."""
         size = (self.panel.width_m, self.panel.height_m)
         return np.asarray(self.panel.T_world_from_face).tobytes() + np.array(size).tobytes()
 
     def texture(self, colours: Tensor) -> Rgb:
-        """See `_Thing`."""
+        """Its texture ``[h, w, 3]`` in these colours."""
         return face_texture(colours.numpy(), TEXTURE_PX)
 
     def put(self, name: str, texture: Rgb) -> None:
-        """See `_Thing`."""
+        """Put it into the scene."""
         self.scene.add_panel(name, self.panel, texture)
 
 
@@ -189,15 +157,15 @@ class _Solid:
 
     @property
     def shape(self) -> bytes:
-        """See `_Thing`."""
+        """All that it depends on except its colours."""
         return self._corners.tobytes()
 
     def texture(self, colours: Tensor) -> Rgb:
-        """See `_Thing`."""
+        """Its texture ``[h, w, 3]`` in these colours."""
         return np.rint(255.0 * np.clip(self.colours(colours), 0.0, 1.0)).astype(np.uint8)
 
     def put(self, name: str, texture: Rgb) -> None:
-        """See `_Thing`. Both sides of each triangle are shown: not all meshes are wound outwards."""
+        """Put it into the scene. Both sides of each triangle are shown: not all meshes are wound outwards."""
         self.scene.add_mesh(name, Mesh(*self._both_sides, texture))
 
     @cached_property
@@ -228,7 +196,7 @@ def _is_solid(field: ColouredObject) -> bool:
     return isinstance(field, VoxelGridObject) and field.face_size_m is None
 
 
-def _thing(scene: World, field: ColouredObject, surface: SurfaceMesh | None) -> _Thing:
+def _thing(scene: World, field: ColouredObject, surface: SurfaceMesh | None) -> _Board | _Solid:
     if isinstance(field, VoxelGridObject) and field.face_size_m is not None:
         if not isinstance(scene, NativePanels):
             raise ConfigError(_refused("panels (add_panel)", scene))

@@ -8,6 +8,7 @@ import torch
 
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.display import DisplayModel
+from advnerf_core.fields.voxel_grid import face_corners_in_object
 from advnerf_core.geometry import invert_transform, planar_pose, transform_points
 from calibration.by_construction import LAB_DATE, METHOD, twin_calibrations
 from calibration.display_colour import DisplayCalibration
@@ -49,7 +50,7 @@ def test_the_face_is_the_centre_square_and_the_rest_is_black(experiment):
 
 
 def test_the_face_of_an_attack_is_where_the_calibrated_monitor_will_show_it(experiment):
-    corners = faces.corners_on(faces.panel_of(experiment))
+    corners = face_corners_in_object(faces.panel_of(experiment).square_m)
     target = centre_square(twin_calibrations(experiment.named_world.config)["monitor"])
     assert target.subject == faces.wanted_face(experiment).panel == "monitor"
     assert np.abs(corners - target.corners).max() < 1e-6
