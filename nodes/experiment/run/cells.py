@@ -19,7 +19,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, over_the_world
 from nodes.experiment.steps import pose_maps
 from nodes.experiment.steps.attack import surrogate_part
-from nodes.experiment.steps.deploy import Deployer, ThroughNodes, ThroughWorld, cell_data
+from nodes.experiment.steps.deploy import cell_data
 from nodes.experiment.steps.films import film_cell, kept_film, with_film
 from nodes.experiment.steps.frozen import check_frozen, freeze
 from nodes.experiment.steps.keys import (
@@ -38,7 +38,7 @@ _SEARCHED = 0.9  # share of a cell's work
 
 
 class Bench:
-    """Common resources of an experiment's cells while several are run one after the other: the open world, the space, the deployer.
+    """Common resources of an experiment's cells while several are run one after the other: the open world, the space, the live nodes.
 
     Args:
         experiment: Experiment with finished scene, objects and policies (``advnerf experiment run FILE --until policy``).
@@ -70,14 +70,11 @@ class Bench:
         return make_space(self.experiment, self.scene if over_the_world(self.experiment) else None)
 
     @cached_property
-    def deployer(self) -> Deployer | None:
-        """The deployer; None if nothing is deployed."""
+    def deployed_in(self) -> World | LiveNodes | None:
+        """The open world, or the live nodes; None if nothing is deployed."""
         if self.experiment.config.deploy.live:
-            return ThroughNodes(self.experiment, self._stack.enter_context(LiveNodes(self.experiment)))
-        if self.experiment.config.deploy.through == "nothing":
-            return None
-        assert self.scene is not None, "it is open where the world's own car drives"
-        return ThroughWorld(self.experiment, self.scene)
+            return self._stack.enter_context(LiveNodes(self.experiment))
+        return None if self.experiment.config.deploy.through == "nothing" else self.scene
 
 
 def run_cell(
@@ -106,12 +103,10 @@ def run_cell(
         tell = partial(report, _SEARCHED)
         tell("driving")
         driven = clean if cell.method == NONE else folder
-        data = cell_data(experiment, shared.space, shared.deployer, cell, driven, clean, tell)
-        if shared.deployer is None or "not_driven_live" in data:
+        data = cell_data(experiment, shared.space, shared.deployed_in, cell, driven, clean, tell)
+        if shared.deployed_in is None or "not_driven_live" in data:
             return data
-        film = kept_film(folder) or film_cell(
-            experiment, shared.deployer.scene, shared.space, cell, folder, driven
-        )
+        film = kept_film(folder) or film_cell(experiment, shared.scene, shared.space, cell, folder, driven)
         return with_film(data, film)
 
 

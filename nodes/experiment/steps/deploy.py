@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -30,70 +29,32 @@ from nodes.lab.trials.tries import NotDrivenError
 DRIVES = "drives.json"
 
 
-class Deployer(Protocol):
-    """Drives past attacks in the deployment."""
-
-    @property
-    def scene(self) -> World | None:
-        """The world, if it is open."""
-
-    def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None], /) -> Deployed:
-        """Drive a searched cell from its deployed starts; its attack file is in ``folder``, which also gets the bags."""
-
-
-@dataclass(frozen=True, eq=False)
-class Deployed:
-    """Deployed drives of one cell.
-
-    Attributes:
-        drives: One drive per start.
-        live: Measurements of each live drive's bag, with the bag's folder.
-    """
-
-    drives: list[DeployedDrive]
-    live: list[dict[str, Any]] = field(default_factory=list)
+def _through_world(
+    experiment: Experiment, scene: World, space: Space, cell: Cell, folder: Path
+) -> list[DeployedDrive]:
+    """One drive per start by the open world's own car, tick by tick."""
+    policy = load_victim(experiment, cell.victim).policy
+    shown = load_shown(space, folder, cell)
+    there = dress(experiment, scene, shown)
+    starts, colours = (
+        deployed_starts(experiment, cell),
+        shown_there(experiment, shown, load_found(folder, cell)),
+    )
+    return deployed_drives(experiment, there, policy, cell.scenario, starts, colours)
 
 
-@dataclass(frozen=True, eq=False)
-class ThroughWorld:
-    """The open world's own car, tick by tick."""
-
-    experiment: Experiment
-    scene: World
-
-    def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None]) -> Deployed:
-        """Drive in this process; see `Deployer.drive`."""
-        del tell
-        experiment = self.experiment
-        policy = load_victim(experiment, cell.victim).policy
-        shown = load_shown(space, folder, cell)
-        there = dress(experiment, self.scene, shown)
-        starts, colours = (
-            deployed_starts(experiment, cell),
-            shown_there(experiment, shown, load_found(folder, cell)),
-        )
-        return Deployed(deployed_drives(experiment, there, policy, cell.scenario, starts, colours))
-
-
-@dataclass(frozen=True, eq=False)
-class ThroughNodes:
-    """The live node graph; every drive leaves a bag."""
-
-    experiment: Experiment
-    nodes: LiveNodes
-    scene: None = None
-
-    def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None]) -> Deployed:
-        """Drive from each start; see `Deployer.drive`."""
-        del space
-        attack = None if cell.method == NONE else (folder / ATTACK).resolve()
-        found = []
-        for number, start in enumerate(deployed_starts(self.experiment, cell).tolist()):
-            name = live_name(number)
-            live = LiveRun(name, cell.victim, cell.scenario, (start[0], start[1], start[2]), attack)
-            driven = drive_until_it_counts(self.experiment, live, folder, tell, self.nodes)
-            found.append({"run": name, **driven})
-        return Deployed([as_drive(self.experiment, each) for each in found], found)
+def _through_nodes(
+    experiment: Experiment, nodes: LiveNodes, cell: Cell, folder: Path, tell: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Measurements of one live drive per start, each with the folder of its bag."""
+    attack = None if cell.method == NONE else (folder / ATTACK).resolve()
+    found = []
+    for number, start in enumerate(deployed_starts(experiment, cell).tolist()):
+        name = live_name(number)
+        live = LiveRun(name, cell.victim, cell.scenario, (start[0], start[1], start[2]), attack)
+        driven = drive_until_it_counts(experiment, live, folder, tell, nodes)
+        found.append({"run": name, **driven})
+    return found
 
 
 def live_name(start: int) -> str:
@@ -109,7 +70,7 @@ def deployed_starts(experiment: Experiment, cell: Cell) -> torch.Tensor:
 def cell_data(
     experiment: Experiment,
     space: Space,
-    deployer: Deployer | None,
+    place: World | LiveNodes | None,
     cell: Cell,
     folder: Path,
     clean: Path,
@@ -120,7 +81,7 @@ def cell_data(
     Args:
         experiment: The experiment.
         space: The search space.
-        deployer: The deployer; None deploys nothing.
+        place: The open world, or the live nodes; None deploys nothing.
         cell: The cell.
         folder: The cell's folder, with the surrogate's part.
         clean: The folder of the same drive without attack, with the surrogate's part.
@@ -150,10 +111,12 @@ def cell_data(
             **({} if learned["attack_id"] is None else {"theta": THETA}),
         },
     }
-    if deployer is not None:
+    if place is not None:
         try:
-            without = deployed_part(space, deployer, cell.clean, clean, tell)
-            driven = without if folder == clean else deployed_part(space, deployer, cell, folder, tell)
+            without = _deployed_part(experiment, space, place, cell.clean, clean, tell)
+            driven = (
+                without if folder == clean else _deployed_part(experiment, space, place, cell, folder, tell)
+            )
         except NotDrivenError as error:
             # Either arm can be the spoiled one. Without both there is nothing to compare, so the cell has no deployed drives at all.
             data["not_driven_live"] = str(error)
@@ -190,24 +153,34 @@ def _live_extra(live: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def deployed_part(
-    space: Space, deployer: Deployer, cell: Cell, folder: Path, tell: Callable[[str], None]
+def _deployed_part(
+    experiment: Experiment,
+    space: Space,
+    place: World | LiveNodes,
+    cell: Cell,
+    folder: Path,
+    tell: Callable[[str], None],
 ) -> dict[str, Any]:
     """Deployed drives of a searched cell from its starts, stored in ``drives.json``; existing ones are read."""
     kept = folder / DRIVES
     if kept.exists():
         found: dict[str, Any] = read_json(kept)
         return found
-    deployed = deployer.drive(space, cell, folder, tell)
+    live: list[dict[str, Any]] = []
+    if isinstance(place, LiveNodes):
+        live = _through_nodes(experiment, place, cell, folder, tell)
+        drives = [as_drive(experiment, each) for each in live]
+    else:
+        drives = _through_world(experiment, place, space, cell, folder)
     data = {
-        "states": [drive.states.tolist() for drive in deployed.drives],
-        "commands": [drive.controls.tolist() for drive in deployed.drives],
-        **totals([drive.metrics for drive in deployed.drives]),
-        "mean_cte_m": [drive.metrics.mean_cte_m for drive in deployed.drives],
-        "max_cte_m": [drive.metrics.max_cte_m for drive in deployed.drives],
-        "blocked_tick": [drive.blocked_tick for drive in deployed.drives],
-        "collided_with": [drive.collided_with for drive in deployed.drives],
-        "live": deployed.live,
+        "states": [drive.states.tolist() for drive in drives],
+        "commands": [drive.controls.tolist() for drive in drives],
+        **totals([drive.metrics for drive in drives]),
+        "mean_cte_m": [drive.metrics.mean_cte_m for drive in drives],
+        "max_cte_m": [drive.metrics.max_cte_m for drive in drives],
+        "blocked_tick": [drive.blocked_tick for drive in drives],
+        "collided_with": [drive.collided_with for drive in drives],
+        "live": live,
     }
     write_atomically(kept, json.dumps(data) + "\n")
     return data

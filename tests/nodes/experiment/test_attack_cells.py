@@ -33,7 +33,7 @@ from nodes.experiment.show.spaces import colour_space
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import attack, frozen, run
 from nodes.experiment.steps.attack import load_shown, surrogate_part
-from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
+from nodes.experiment.steps.deploy import DRIVES, cell_data
 from nodes.experiment.steps.films import film_cell
 from nodes.experiment.steps.keys import NoSuchCellError, cell_settings, clean_folder, settings_hash
 from nodes.experiment.steps.shared_search import search_key, take_search
@@ -63,7 +63,7 @@ def finished(experiment: Experiment, scene: Any, cell: Cell) -> dict[str, Any]:
     surrogate_part(experiment, space, cell.clean, clean, silent)
     at = clean if cell.method == "none" else folder
     surrogate_part(experiment, space, cell, at, silent)
-    data = cell_data(experiment, space, ThroughWorld(experiment, scene), cell, at, clean, print)
+    data = cell_data(experiment, space, scene, cell, at, clean, print)
     kept = {**data, "settings_hash": "h", "machine": "m", "date": "d"}
     experiment.cell_result(cell).write_text(json.dumps(kept))
     return data

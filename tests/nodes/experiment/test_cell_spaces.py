@@ -33,7 +33,7 @@ from nodes.experiment.show.spaces import make_space, mesh_objects
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import attack, films, run
 from nodes.experiment.steps.attack import surrogate_part
-from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
+from nodes.experiment.steps.deploy import DRIVES, cell_data
 from nodes.experiment.steps.keys import NoSuchCellError, settings_hash
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
@@ -72,7 +72,7 @@ def whole(experiment: Experiment, scene: Any, cell: Cell, folder: Path) -> dict[
     surrogate_part(experiment, space, cell.clean, clean, silent)
     at = clean if cell.method == "none" else folder
     surrogate_part(experiment, space, cell, at, silent)
-    return cell_data(experiment, space, ThroughWorld(experiment, scene), cell, at, clean, print)
+    return cell_data(experiment, space, scene, cell, at, clean, print)
 
 
 @pytest.mark.usefixtures("mitsuba")

@@ -28,7 +28,7 @@ from nodes.experiment.show.objects import placed_objects, surrogate_of
 from nodes.experiment.show.spaces import colour_space
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem, surrogate_part
-from nodes.experiment.steps.deploy import DRIVES, ThroughWorld, cell_data
+from nodes.experiment.steps.deploy import DRIVES, cell_data
 from nodes.experiment.steps.films import film_cell, filmed
 from nodes.experiment.steps.run import load_experiment
 from nodes.experiment.steps.search_files import SEARCHED
@@ -183,7 +183,7 @@ def test_search_drive_and_film_in_finer_ticks(trained: Experiment, wall: Any, tm
     for each, at in ((cell.clean, clean), (cell, folder)):
         found = surrogate_part(experiment, space, each, at, lambda fraction, text="": None)
     assert len(found["curve_total_cte_m"]) == experiment.config.attack.evaluations
-    result = cell_data(experiment, space, ThroughWorld(experiment, wall), cell, folder, clean, print)
+    result = cell_data(experiment, space, wall, cell, folder, clean, print)
     assert result["extra"]["horizon"] == 10
     for name in (SEARCHED, DRIVES):
         (states,) = np.array(json.loads((folder / name).read_text())["states"])
