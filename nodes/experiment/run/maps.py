@@ -27,8 +27,8 @@ def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int | None 
     """
     store, pictures = Store(experiment.folder), []
     for cell in cells:
-        (planned,) = plan_cells(experiment, [cell])
-        status = store.status(cell, planned.job.settings_hash)
+        (job,) = plan_cells(experiment, [cell])
+        status = store.status(cell, job.settings_hash)
         if status.state != "done" or status.result is None:
             continue
         with ProgressDisplay() as display:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from advnerf_core.report.evidence.registration import RegisteredCell, Registration, read_registration
@@ -18,22 +17,8 @@ from nodes.experiment.steps.keys import registered_settings, settings_hash
 from nodes.runtime.errors import ConfigError, RuntimeFault
 
 
-@dataclass(frozen=True)
-class Planned:
-    """A cell with its current settings.
-
-    Attributes:
-        job: Job that runs it; without threads and phase.
-        live: Whether it drives a live graph.
-    """
-
-    cell: Cell
-    job: Job
-    live: bool
-
-
-def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Planned]:
-    """Current settings of every cell; reads variants and digests of their stages, and runs nothing."""
+def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Job]:
+    """A job for every cell, with its current settings; reads variants and digests of their stages, and runs nothing."""
     registration = read_registration(PUBLISHED / experiment.config.name)
     planned = []
     for cell in cells:
@@ -47,8 +32,9 @@ def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Planned]:
             settings_hash(of, cell.inside),
             threads=1,
             registration=registered_under(registration, cell, registered_settings(of)),
+            alone=runs_alone(of),
         )
-        planned.append(Planned(cell, job, runs_alone(of)))
+        planned.append(job)
     return planned
 
 
@@ -92,7 +78,7 @@ def current_key(experiment: Experiment, cell: Cell) -> str | None:
         ConfigError: The cell's variant is wrong.
     """
     try:
-        return plan_cells(experiment, [cell])[0].job.settings_hash
+        return plan_cells(experiment, [cell])[0].settings_hash
     except ConfigError:
         raise
     except (RuntimeFault, OSError):

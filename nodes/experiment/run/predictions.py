@@ -46,15 +46,15 @@ def predict_cells(
     for cell in cells:
         if not cell.searched:
             continue
-        planned = plan_cells(experiment, [cell])[0]
+        (job,) = plan_cells(experiment, [cell])
         # Work with other settings may have a search too, of another attack.
         if not is_predictable(experiment.of(cell)):
             continue
         file = prediction_file(experiment.folder, cell.name)
-        kept = kept_prediction(file, planned.job.settings_hash)
+        kept = kept_prediction(file, job.settings_hash)
         if kept is not None and kept.get("draws") == draws:
             continue
-        if not store.has_begun(cell.name, planned.job.settings_hash):
+        if not store.has_begun(cell.name, job.settings_hash):
             if kept is not None or store.result(cell.name) is not None:
                 say(f"{cell.name}: not predicted, as its search is not in {store.work(cell.name)}")
             continue
@@ -65,7 +65,7 @@ def predict_cells(
         drive = (cell.scenario, cell.victim, cell.seed)
         found, clean[drive] = predict_cell(*which, draws, clean.get(drive))
         summary = clean[drive].agreement.summary()
-        record = {"settings_hash": planned.job.settings_hash, **found.record(), "clean_drive": summary}
+        record = {"settings_hash": job.settings_hash, **found.record(), "clean_drive": summary}
         write_json(file, record)
         say(
             f"{cell.name}: excess of {found.excess_m_per_tick[1]:.3f} m per tick expected, {100 * found.retained:.0f} % of the effect survives"

@@ -16,7 +16,7 @@ from rich.console import Console
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.admission import past_the_gate
 from nodes.experiment.run.cells import Bench, needed_settings
-from nodes.experiment.run.plan import Planned, elsewhere, plan_cells
+from nodes.experiment.run.plan import elsewhere, plan_cells
 from nodes.experiment.run.store import NOT_DRIVEN, Store
 from nodes.experiment.run.worker import Ended, Job, Phase, run_here, run_in_process, wait_for_live
 from nodes.experiment.show.context import Experiment
@@ -98,7 +98,7 @@ def run_cells(
     ]
     if not wanted:
         there = sum(
-            store.status(each.cell, each.job.settings_hash, elsewhere(experiment, each.cell)).state == "done"
+            store.status(each.cell, each.settings_hash, elsewhere(experiment, each.cell)).state == "done"
             for each in plan
         )
         say(
@@ -112,28 +112,28 @@ def run_cells(
     if options.search_only:
         say(f"{len(wanted)} cells to search, {_at_a_time(jobs, threads)}")
         return _run_beside(
-            [replace(each.job, threads=threads, phase="search") for each in wanted], jobs, options, say
+            [replace(each, threads=threads, phase="search") for each in wanted], jobs, options, say
         )
     say(f"{len(wanted)} of {len(cells)} cells to run, {_at_a_time(jobs, threads)}")
-    beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
-    beside += [replace(each.job, threads=threads, phase="search") for each in wanted if each.live]
+    beside = [replace(each, threads=threads) for each in wanted if not each.alone]
+    beside += [replace(each, threads=threads, phase="search") for each in wanted if each.alone]
     ended = _run_beside(beside, jobs, options, say)
     lost = {end.name for end in ended if end.how != "done"}
     searched = {job.name for job in beside if job.phase == "search"}
     ended = [end for end in ended if end.name not in searched or end.how != "done"]
     # The live graphs have the machine to themselves, one after the other; they share their nodes.
-    alone = [each for each in wanted if each.live and each.cell.name not in lost]
+    alone = [each for each in wanted if each.alone and each.cell.name not in lost]
     ended += _run_here(
         store, alone, experiment, options, say, ProgressDisplay(console, watcher), searched=True
     )
     # Their drives without attack exist now.
-    past_the_gate(experiment, [each.cell for each in wanted if each.live], options.gate, say)
+    past_the_gate(experiment, [each.cell for each in wanted if each.alone], options.gate, say)
     return ended
 
 
 def _run_here(
     store: Store,
-    wanted: Sequence[Planned],
+    wanted: Sequence[Job],
     experiment: Experiment,
     options: Options,
     say: Say,
@@ -157,7 +157,7 @@ def _run_on(
     variant: Experiment,
     bench: Bench,
     store: Store,
-    cells: Sequence[Planned],
+    cells: Sequence[Job],
     options: Options,
     display: ProgressDisplay,
     searched: bool,
@@ -166,11 +166,11 @@ def _run_on(
     reports: dict[str, Report] = {}
     seconds: dict[str, float] = {}
 
-    def run(each: Planned, phase: Phase, last: bool = True) -> Ended:
+    def run(each: Job, phase: Phase, last: bool = True) -> Ended:
         name = each.cell.name
         if name not in reports:
             reports[name] = display.start(name)
-        job = replace(each.job, threads=_cores(), phase=phase)
+        job = replace(each, threads=_cores(), phase=phase)
         end = run_here(job, store, variant, bench, reports[name])
         seconds[name] = seconds.get(name, 0.0) + end.seconds
         if end.how == "done" and last:
@@ -181,10 +181,10 @@ def _run_on(
 
     if options.search_only:
         return [run(each, "search") for each in cells]
-    first = [] if searched else [each for each in cells if each.live]
+    first = [] if searched else [each for each in cells if each.alone]
     lost = {each.cell.name: end for each in first if (end := run(each, "search", last=False)).how != "done"}
     left = [each for each in cells if each.cell.name not in lost]
-    with wait_for_live() if any(each.live for each in left) else nullcontext():
+    with wait_for_live() if any(each.alone for each in left) else nullcontext():
         return [*lost.values(), *(run(each, "whole") for each in left)]
 
 
@@ -218,8 +218,8 @@ def _refuse_two_in_one_folder(experiment: Experiment, cells: Sequence[Cell]) -> 
             )
 
 
-def _is_wanted(store: Store, each: Planned, elsewhere: Sequence[Path], options: Options, say: Say) -> bool:
-    status = store.status(each.cell, each.job.settings_hash, elsewhere)
+def _is_wanted(store: Store, each: Job, elsewhere: Sequence[Path], options: Options, say: Say) -> bool:
+    status = store.status(each.cell, each.settings_hash, elsewhere)
     if status.state == NOT_DRIVEN:
         if options.retry:
             _allow_more_tries(store, each.cell.name)

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 import traceback
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -24,7 +23,7 @@ from advnerf_core.plugins import exit_refused, in_one_line
 from advnerf_core.run_module import module_command
 from nodes.experiment.engine.artefact import digests_in
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cells import Bench, run_cell, runs_alone, search_cell
+from nodes.experiment.run.cells import Bench, run_cell, search_cell
 from nodes.experiment.run.store import LOG, Store
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.keys import cell_settings, settings_hash, stages_needed
@@ -60,6 +59,7 @@ class Job:
         settings_hash: Hash of everything that the result depends on, at planning time.
         phase: ``search``: only the part that may run beside others; ``whole``: all of it.
         registration: Digest of the registration that it is run under; empty without one.
+        alone: Whether it needs the machine for itself, see `runs_alone`.
     """
 
     folder: str
@@ -71,6 +71,7 @@ class Job:
     threads: int
     phase: Phase = "whole"
     registration: str = ""
+    alone: bool = False
 
     @property
     def name(self) -> str:
@@ -239,8 +240,7 @@ def _run(
         search_cell(experiment, job.cell.inside, work, report, bench)
         _add_seconds(work, time.monotonic() - began)
         return
-    with wait_for_live() if bench is None and runs_alone(experiment) else nullcontext():
-        found = run_cell(experiment, job.cell.inside, work, report, bench)
+    found = run_cell(experiment, job.cell.inside, work, report, bench)
     ours = {
         "scenario": job.cell.scenario,
         "victim": job.cell.victim,

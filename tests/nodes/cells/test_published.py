@@ -37,7 +37,7 @@ def put(plan, folder, settings_hash=None, **changes):
         "method": cell.method,
         "seed": cell.seed,
         "attack_id": None,
-        "settings_hash": settings_hash or plan.job.settings_hash,
+        "settings_hash": settings_hash or plan.settings_hash,
         "seconds": 1.0,
         "machine": "m",
         "date": "d",
@@ -236,5 +236,5 @@ def test_a_cell_that_its_experiment_ran_itself_is_published_too(here, tmp_path):
     found = publish(loaded, statuses(loaded, loaded.cells), tmp_path / "kept")
     assert found.written == (plan.cell.name,)
     kept = json.loads((tmp_path / "kept" / loaded.config.name / f"{plan.cell.name}.json").read_text())
-    assert kept["settings_hash"] == plan.job.settings_hash
+    assert kept["settings_hash"] == plan.settings_hash
     assert publish(loaded, statuses(loaded, loaded.cells), tmp_path / "kept").same == (plan.cell.name,)

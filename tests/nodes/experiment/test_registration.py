@@ -104,7 +104,7 @@ def test_a_registration_after_the_fact_is_refused(experiment, tmp_path):
     planned = plan_cells(experiment, experiment.cells[:1])[0]
     work = experiment.folder / "cells" / planned.cell.name
     work.mkdir(parents=True)
-    write_key(work / "key.json", planned.job.settings_hash, Settings.of())
+    write_key(work / "key.json", planned.settings_hash, Settings.of())
     with pytest.raises(RegistrationError, match="before anything is run"):
         register(experiment, experiment.cells, tmp_path)
     assert not (tmp_path / "junction" / FILE).exists()
