@@ -32,7 +32,7 @@ from nodes.experiment.plan.space_config import ColoursConfig
 from nodes.experiment.run.plan import registered_cell, statuses
 from nodes.experiment.run.store import FINISHED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.given import given
+from nodes.experiment.show.given import given_in, given_victim
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment.steps.keys import own_recipes, registered_settings
@@ -95,7 +95,8 @@ def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario
         experiment: Experiment with known world and victims.
         name: Name of the path in the experiment.
     """
-    config, limits, found = experiment.config, experiment.limits, given(experiment)
+    config, limits = experiment.config, experiment.limits
+    found = {name: given_victim(experiment, name) for name in given_in(config)}
     settings, own = registered_settings(experiment), own_recipes(config)
     starts = [(float(x), float(y), float(yaw)) for x, y, yaw in experiment.measured_starts(name).tolist()]
     deployed = 0 if config.deploy.through == "nothing" else len(starts[: config.deploy.starts])

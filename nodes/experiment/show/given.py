@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -60,17 +59,12 @@ def read_kept(folder: Path) -> dict[str, GivenPolicy]:
     return {name: GivenPolicy.model_validate(each) for name, each in read_json(file).items()}
 
 
-def given(experiment: RunFolder[ExperimentConfig]) -> Mapping[str, GivenPolicy]:
-    """Stored facts about the existing victims, by name; nothing of them is executed.
+def given_victim(experiment: RunFolder, victim: str) -> GivenPolicy:
+    """Stored facts about one existing victim, whether or not the others were loaded; nothing of it is executed.
 
     Raises:
-        VictimUnknownError: A victim was not loaded yet, or its file or code has changed since.
+        VictimUnknownError: The victim was not loaded yet, or its file or code has changed since.
     """
-    return {name: given_victim(experiment, name) for name in given_in(experiment.config)}
-
-
-def given_victim(experiment: RunFolder[ExperimentConfig], victim: str) -> GivenPolicy:
-    """Stored facts about one existing victim, whether or not the others were loaded; see `given`."""
     spec, kept = given_in(experiment.config)[victim], read_kept(experiment.folder).get(victim)
     if kept is None or (kept.policy, kept.source_sha256) != (spec, source_sha256(spec)):
         raise VictimUnknownError(
@@ -80,7 +74,7 @@ def given_victim(experiment: RunFolder[ExperimentConfig], victim: str) -> GivenP
     return kept
 
 
-def victim_spec(experiment: RunFolder[ExperimentConfig], victim: str) -> str:
+def victim_spec(experiment: RunFolder, victim: str) -> str:
     """Name of a victim for `load_any_policy` and the policy node; the retrained one is the first round's, as in the paper."""
     if victim == RETRAINED:
         return str(experiment.stage_folder("retrain") / "round0" / "policy.safetensors")
@@ -91,14 +85,14 @@ def victim_spec(experiment: RunFolder[ExperimentConfig], victim: str) -> str:
     return str(experiment.stage_folder(experiment.config.policy_stage(victim)) / f"{name}.safetensors")
 
 
-def victim_sha256(experiment: RunFolder[ExperimentConfig], victim: str) -> str:
+def victim_sha256(experiment: RunFolder, victim: str) -> str:
     """Content hash of a victim; nothing of it is executed."""
     if victim in given_in(experiment.config):
         return given_victim(experiment, victim).sha256
     return policy_sha256(victim_spec(experiment, victim))
 
 
-def victim_without_gradient(experiment: RunFolder[ExperimentConfig]) -> bool:
+def victim_without_gradient(experiment: RunFolder) -> bool:
     """Whether the main victim declares that it has no gradient."""
     main = experiment.config.main_victim
     return main in given_in(experiment.config) and not given_victim(experiment, main).declared.differentiable

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Variants(RunFolder[ExperimentConfig]):
+class Variants(RunFolder):
     """One resolved experiment with its variants, or one of these.
 
     Attributes:

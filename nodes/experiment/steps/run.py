@@ -12,9 +12,9 @@ from advnerf_core.documents import Document
 from advnerf_core.plugins import unknown
 from advnerf_core.run_module import search_folder_last
 from hardware.worlds.world import NativeMeshes, NativePanels, Photographed
-from nodes.experiment.engine.artefact import REFERENCE, Artefact
-from nodes.experiment.engine.run_folder import require_own_folder, run_to_end
-from nodes.experiment.engine.stages import begun_with, stage_digests
+from nodes.experiment.engine.artefact import REFERENCE
+from nodes.experiment.engine.run_folder import require_own_folder, write_manifest
+from nodes.experiment.engine.stages import begun_with, run_stages, stage_digests
 from nodes.experiment.plan.carriers import ComposedConfig, FaceCarrier, NativeConfig, ScreenConfig
 from nodes.experiment.plan.object_kinds import PANEL
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
@@ -28,18 +28,8 @@ from nodes.experiment.steps.live import check_live
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.lab.worlds.named import read_world
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import StageDisplay
+from nodes.runtime.progress import ProgressDisplay, StageDisplay
 
-_LIBRARIES = (
-    "torch",
-    "numpy",
-    "numba",
-    "opencv-contrib-python-headless",
-    "mujoco",
-    "pyzmq",
-    "rosbags",
-    "mcap",
-)
 _WHOLE_STEP_S = 1e-6
 
 
@@ -202,29 +192,30 @@ def make_ready(
     console: Console | None = None,
     anew: bool = False,
     watcher: StageDisplay | None = None,
-) -> dict[str, Artefact]:
+) -> None:
     """Load existing victims, and run the unfinished stages that cells need. Stages stored with the code count as finished, unless
     ``anew`` is set.
 
+    Args:
+        experiment: The experiment, whose folder may have results of stages.
+        until: Last stage to run; None runs all.
+        console: Console of the progress.
+        anew: Whether to make stages here that are stored with the code.
+        watcher: Also receives the progress.
+
     Raises:
+        ConfigError: The folder has the stages of another experiment, which would be replaced.
         AdvnerfError: A stage failed, or the policy's architecture cannot be built.
     """
-    reference = None if anew else REFERENCE
     require_own_folder(experiment)
     look_at_given(experiment)
     keep_worlds(experiment.folder, experiment.named_worlds)
     for each in experiment.config.trained.values():
         each.network.check()
-    stages = stages_of(experiment)
-    return run_to_end(
-        experiment,
-        stages,
-        _LIBRARIES,
-        None if experiment.config.own_scene else until,
-        console,
-        reference,
-        watcher,
-    )
+    stages, last = stages_of(experiment), None if experiment.config.own_scene else until
+    write_manifest(experiment)
+    with ProgressDisplay(console, watcher) as display:
+        run_stages(stages, experiment.folder, display, last, None if anew else REFERENCE)
 
 
 def prepare_victims(experiment: Experiment) -> None:

@@ -1,38 +1,46 @@
 import io
 import json
-from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from nodes.experiment.engine.artefact import Settings
-from nodes.experiment.engine.run_folder import RunFolder, run_to_end
 from nodes.experiment.engine.stages import Stage
+from nodes.experiment.steps import run
 from nodes.runtime.errors import ConfigError
 
 
-def run(folder, name, value=1):
-    config = SimpleNamespace(name=name, model_dump=lambda **_: {"value": value})
-    stage = Stage(
-        "capture", lambda here, told: (here / "photo").write_text(f"{name} {value}"), Settings.of(value=value)
-    )
-    experiment = RunFolder(config, folder / f"{name}.experiment.yaml", folder, "demo")
-    return run_to_end(experiment, [stage], ["numpy"], None, Console(file=io.StringIO()))
+@pytest.fixture
+def run_in(tiny_file, monkeypatch):
+    """Runs the one stage of an experiment in a folder."""
+
+    def run_one(folder, name, value=1):
+        stage = Stage(
+            "capture",
+            lambda here, told: (here / "photo").write_text(f"{name} {value}"),
+            Settings.of(value=value),
+        )
+        monkeypatch.setattr(run, "stages_of", lambda experiment: [stage])
+        experiment = run.load_experiment(tiny_file(name=name), "tiny", [], folder)
+        run.make_ready(experiment, console=Console(file=io.StringIO()))
+
+    return run_one
 
 
-def test_the_folder_of_another_experiment_is_not_emptied(tmp_path):
-    run(tmp_path, "room")
+def test_the_folder_of_another_experiment_is_not_emptied(run_in, tmp_path):
+    folder = tmp_path / "run"
+    run_in(folder, "room")
     with pytest.raises(
         ConfigError, match=r"run folder of experiment 'town' .* of 'room'; name another one with --folder"
     ):
-        run(tmp_path, "town", 2)
-    assert (tmp_path / "capture" / "photo").read_text() == "room 1"
-    run(tmp_path, "room", 3)
-    assert (tmp_path / "capture" / "photo").read_text() == "room 3"
+        run_in(folder, "town", 2)
+    assert (folder / "capture" / "photo").read_text() == "room 1"
+    run_in(folder, "room", 3)
+    assert (folder / "capture" / "photo").read_text() == "room 3"
     # Who says so has its stages replaced; what cannot be read says nothing.
-    (tmp_path / "manifest.json").unlink()
-    run(tmp_path, "town", 2)
-    assert json.loads((tmp_path / "manifest.json").read_text())["experiment"] == "town"
-    (tmp_path / "manifest.json").write_text("{")
-    run(tmp_path, "room", 4)
-    assert (tmp_path / "capture" / "photo").read_text() == "room 4"
+    (folder / "manifest.json").unlink()
+    run_in(folder, "town", 2)
+    assert json.loads((folder / "manifest.json").read_text())["experiment"] == "town"
+    (folder / "manifest.json").write_text("{")
+    run_in(folder, "room", 4)
+    assert (folder / "capture" / "photo").read_text() == "room 4"
