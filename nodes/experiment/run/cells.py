@@ -7,7 +7,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from advnerf_core.attack.artifact import PLACES, load_attack
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.report.conditions import NONE
 from hardware.worlds.world import World
@@ -17,20 +16,13 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.space_config import PlacesConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, over_the_world
-from nodes.experiment.steps import pose_maps
 from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import cell_data
 from nodes.experiment.steps.films import film_cell, kept_film, with_film
 from nodes.experiment.steps.frozen import check_frozen, freeze
-from nodes.experiment.steps.keys import (
-    NoSuchCellError,
-    clean_folder,
-    require_known,
-    stages_needed,
-)
+from nodes.experiment.steps.keys import clean_folder, require_known, stages_needed
 from nodes.experiment.steps.live import LiveNodes
 from nodes.experiment.steps.pipeline import stages_of
-from nodes.experiment.steps.search_files import ATTACK
 from nodes.experiment.steps.shared_search import take_search
 from nodes.runtime.progress import Report
 
@@ -132,22 +124,6 @@ def search_cell(
         take_search(experiment, cell, folder)
         surrogate_part(experiment, shared.space, cell, folder, report)
     return clean
-
-
-def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, report: Report) -> list[Path]:
-    """Loss landscape and robustness map of a finished cell of places; empty for a cell that moved no object.
-
-    Raises:
-        CellError: The cell has no object of this number.
-    """
-    if not cell.searched or not isinstance(experiment.config.space, PlacesConfig):
-        return []
-    count = len(experiment.objects)
-    if not 0 <= number < count:
-        raise NoSuchCellError(f"expected an object of 0 to {count - 1}, got {number}")
-    attack = load_attack(folder / ATTACK)
-    assert attack.space == PLACES, "the file was written by a cell of this experiment"
-    return pose_maps.draw_maps(experiment, cell, attack, number, folder, report)
 
 
 def keep_build(experiment: Experiment, reference: ReferenceBuild) -> list[Path]:

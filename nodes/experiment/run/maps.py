@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cells import draw_maps
 from nodes.experiment.run.plan import plan_cells
 from nodes.experiment.run.store import Store
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.pose_maps import draw_maps
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 

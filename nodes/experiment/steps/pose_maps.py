@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.artifact import AttackFile
+from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.pose_maps import (
     Landscape,
     PoseMapError,
@@ -25,10 +25,13 @@ from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.files import write_atomically
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.maps_config import LandscapeConfig, RobustnessMapConfig
+from nodes.experiment.plan.space_config import PlacesConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
+from nodes.experiment.steps.keys import NoSuchCellError
+from nodes.experiment.steps.search_files import ATTACK
 from nodes.runtime.progress import Report
 
 
@@ -94,22 +97,28 @@ class Mapped:
         return found, picture
 
 
-def draw_maps(
-    experiment: Experiment, cell: Cell, attack: AttackFile, number: int, folder: Path, report: Report
-) -> list[Path]:
-    """Both maps about a finished cell, in the learned scene.
+def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, report: Report) -> list[Path]:
+    """Both maps about a finished cell, in the learned scene: the other objects keep the places of its attack, and all keep its colours.
 
     Args:
-        experiment: Experiment with finished scene and objects, whose space is places.
+        experiment: Experiment with finished scene and objects.
         cell: The finished cell.
-        attack: Attack of the cell: the other objects keep its places, and all keep its colours.
         number: Number of the moved object.
-        folder: Folder for ``landscape_<name>.json``, ``robustness_<name>.json`` and a PNG of each; it also stores finished points.
+        folder: Folder of the cell, for ``landscape_<name>.json``, ``robustness_<name>.json`` and a PNG of each; it also stores finished points.
         report: Called with the finished fraction.
 
     Returns:
-        The pictures.
+        The pictures; none for a cell that moved no object.
+
+    Raises:
+        CellError: The cell has no object of this number.
     """
+    if not cell.searched or not isinstance(experiment.config.space, PlacesConfig):
+        return []
+    count = len(experiment.objects)
+    if not 0 <= number < count:
+        raise NoSuchCellError(f"expected an object of 0 to {count - 1}, got {number}")
+    attack = load_attack(folder / ATTACK)
     space, name, maps = make_space(experiment, None), experiment.objects[number].name, experiment.config.maps
     assert isinstance(space.sensor, PlacedSensor), "the space of places has this sensor"
     problem = attack_problem(

@@ -26,7 +26,6 @@ from nodes.experiment.plan.space_config import (
     MeshTextureConfig,
     PlacesConfig,
 )
-from nodes.experiment.run import cells
 from nodes.experiment.run.cells import has_learned_scene, is_predictable, run_cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, mesh_objects
@@ -35,6 +34,7 @@ from nodes.experiment.steps import attack, films, run
 from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, cell_data
 from nodes.experiment.steps.keys import NoSuchCellError, settings_hash
+from nodes.experiment.steps.pose_maps import draw_maps
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from tests.support.glb import mesh_from_glb
@@ -295,7 +295,7 @@ def test_maps_are_of_what_the_cell_found(trained: Experiment, tmp_path: Path) ->
     assert settings_hash(experiment, PLACES) == settings_hash(searching(trained, ONE), PLACES)
     run_cell(experiment, PLACES, tmp_path, silent)
     asked = (experiment, PLACES)
-    pictures = cells.draw_maps(*asked, 1, tmp_path, silent)
+    pictures = draw_maps(*asked, 1, tmp_path, silent)
     assert [cv2.imread(str(picture)) is not None for picture in pictures] == [True, True]
     rows = json.loads((tmp_path / f"robustness_{trained.objects[1].name}.json").read_text())["cells"]
     # The first start past objects that nobody has moved is the drive that was searched.
@@ -304,11 +304,11 @@ def test_maps_are_of_what_the_cell_found(trained: Experiment, tmp_path: Path) ->
     )
     assert len(rows) == 2
     kept = pictures[0].with_suffix(".json").stat().st_mtime_ns
-    cells.draw_maps(*asked, 1, tmp_path, silent)
+    draw_maps(*asked, 1, tmp_path, silent)
     assert pictures[0].with_suffix(".json").stat().st_mtime_ns == kept
     with pytest.raises(NoSuchCellError, match="expected an object of 0 to 4, got 5"):
-        cells.draw_maps(*asked, 5, tmp_path, silent)
-    assert cells.draw_maps(experiment, PLACES.clean, 1, tmp_path, silent) == []
+        draw_maps(*asked, 5, tmp_path, silent)
+    assert draw_maps(experiment, PLACES.clean, 1, tmp_path, silent) == []
 
 
 @pytest.mark.parametrize(
