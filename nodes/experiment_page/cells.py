@@ -17,10 +17,9 @@ _LOG_BYTES = 2000
 def cell_part(
     folder: Path, cell: Mapping[str, Any], part: Mapping[str, Any], began_s: float
 ) -> dict[str, Any]:
-    """State of a cell: the record's, unless the cell's files are newer.
+    """State of a cell: the record's, unless the cell's files in the folder of cells are newer.
 
     Args:
-        folder: Folder of the cells.
         cell: The cell's entry in the record.
         part: The cell's progress in the record.
         began_s: When the experiment was started [s since 1970]; older files are of an earlier run.

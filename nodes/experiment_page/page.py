@@ -93,7 +93,6 @@ def run_with_page(
 
     Args:
         port: TCP port; 0 selects a free one.
-        run: Runs the experiment with the given progress record.
         say: Callback for messages: the address, and what to do at the end.
         opens: Whether the page is opened in the user's browser, if there is one.
         stays: Whether the page is still served when the experiment has ended.

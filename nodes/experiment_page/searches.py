@@ -45,11 +45,7 @@ class Search:
 
 
 def read_search(folder: Path, state: str = STATE) -> Search | None:
-    """The search of a cell's folder; None before it has results.
-
-    Args:
-        state: Name of the state file that a running search keeps.
-    """
+    """The search of a cell's folder, while it runs from the state file of this name; None before it has results."""
     for name, read in ((SEARCHED, _finished), (state, _running)):
         try:
             changed_ns = (folder / name).stat().st_mtime_ns

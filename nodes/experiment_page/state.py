@@ -20,11 +20,7 @@ _LINES = 40
 
 
 def read_state(folder: Path, now_s: float) -> dict[str, Any]:
-    """The page's current data.
-
-    Args:
-        now_s: Seconds since 1970.
-    """
+    """The page's current data at ``now_s``, seconds since 1970."""
     record = read_progress(folder)
     if not record:
         return {"name": folder.name, "phase": "waiting", "parts": [], "curves": [], "searches": []}

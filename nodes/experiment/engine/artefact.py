@@ -59,13 +59,9 @@ class Settings:
     def of(
         cls, model: BaseModel | None = None, include: Any = None, exclude: Any = None, **inputs: Any
     ) -> Settings:
-        """Settings of a model, or of a part of it, with inputs.
+        """Settings of a model, or of the part of it that ``include`` and ``exclude`` choose as for `BaseModel.model_dump`, with inputs.
 
-        Args:
-            model: The configuration; None for inputs alone.
-            include: Fields that count, as for `BaseModel.model_dump`; None for all.
-            exclude: Fields that do not count.
-            **inputs: Plain data without defaults, such as digests.
+        Inputs are plain data without defaults, such as digests; without a model there are only these.
         """
 
         resolved, keyed = (
@@ -200,10 +196,7 @@ class ReferenceBuild:
         return found if found is not None and found.key == key else None
 
     def take(self, name: str, key: str, folder: Path) -> Artefact | None:
-        """Copy a stage from here into its folder in a run folder, replacing the content.
-
-        Returns:
-            The stage's record; None if it is not here.
+        """Copy a stage from here into its folder in a run folder, replacing the content; returns its record, None if it is not here.
 
         Raises:
             ReferenceBuildError: The files differ from the stored ones.

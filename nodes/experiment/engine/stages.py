@@ -69,13 +69,7 @@ def key_of(stage: Stage, records: Mapping[str, Artefact]) -> str:
 
 
 def stage_digests(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild) -> dict[str, str]:
-    """Digests of the stages' outputs that a run folder has, or else a reference build.
-
-    Args:
-        stages: The stages, each after those it names in ``after``.
-        folder: The run folder.
-        reference: The reference build.
-    """
+    """Digests of the stages' outputs that a run folder has, or else a reference build."""
     records: dict[str, Artefact] = {}
     for stage in stages:
         if any(name not in records for name in stage.after):
@@ -93,14 +87,11 @@ def run_stages(
     until: str | None = None,
     reference: ReferenceBuild | None = None,
 ) -> dict[str, Artefact]:
-    """Run the stages in order, skipping those with a current result.
+    """Run the stages in order, skipping those with a current result here or in a reference build.
 
     Args:
         stages: The stages, each after those it names in ``after``.
-        folder: The run folder.
-        display: Progress display for starts, progress and ends.
         until: Name of the last stage to run; None runs all.
-        reference: Reference build that may have results.
 
     Returns:
         The record of every stage up to ``until``, by name.

@@ -17,11 +17,7 @@ def telling(
 ) -> OnEvaluation:
     """A callback that reports evaluations as progress: the finished fraction, and as text the last and the best total, and the total without attack.
 
-    Args:
-        evaluations: Total number of evaluations.
-        report: Called with the fraction and the text.
-        clean: The drive without attack, to show its total beside the others.
-        objective: Objective of the search; its last and best value are reported too, unless it is ``cte``.
+    The last and the best value of an objective other than ``cte`` are reported too.
     """
     best: Evaluation | None = None
     beside = "" if clean is None else f", {clean.short}"

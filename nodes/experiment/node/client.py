@@ -30,14 +30,11 @@ def new_request_id(name: str) -> str:
 def ask_for_attack(
     run_dir: Path, request: str, request_id: str, tell: Callable[[Any], None], follow: bool = True
 ) -> Any:
-    """Send a request and listen until it has ended, or only until the node has answered.
+    """Send a request, as `request.as_text` writes it, and listen until it has ended, or only until the node has answered.
 
     Args:
-        run_dir: Run folder of the node.
-        request: The request, as `request.as_text` writes it.
         request_id: Name of the request; an identical request under the same name is resumed.
         tell: Called with every ``AttackProgress`` of the request.
-        follow: Whether to wait for the end.
 
     Returns:
         The last ``AttackProgress``.

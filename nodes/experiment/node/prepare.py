@@ -26,12 +26,7 @@ from nodes.experiment.steps.shared_search import search_key
 
 
 def load_request(file: Path, overrides: Sequence[str] = (), folder: Path | None = None) -> Experiment:
-    """Read an experiment file with a single request.
-
-    Args:
-        file: A ``*.experiment.yaml`` file.
-        overrides: ``section.key=value`` texts.
-        folder: Folder of the search; None for the file's ``run_folder``, or ``runs/<name>``.
+    """Read an experiment file with a single request; see `load_experiment`.
 
     Raises:
         ConfigError: A key is unknown or a value wrong, reported with file and line; or the experiment is not a single request.

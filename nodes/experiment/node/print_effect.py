@@ -61,11 +61,9 @@ def print_effect(
     scale: float,
     T_world_from_face: Array | None,
 ) -> PrintEffect:
-    """Drive past a print.
+    """Drive past a print of an attack, as its request says.
 
     Args:
-        request: The attack's request.
-        attack: The attack that was printed.
         name: The object whose texture it is.
         texture: The print with its border as the driving camera sees it, ``[n, n, 3]`` uint8.
         scale: Its true size with its border over the size of the attack's texture.

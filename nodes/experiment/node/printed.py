@@ -39,10 +39,7 @@ def export_attack(attack: AttackFile, folder: Path, stem: str) -> list[Path]:
 def write_poster(
     poster: Poster, target: Path, paper: Paper, dpi: float, margin_mm: float, overlap_mm: float
 ) -> str:
-    """Write a poster as PDF or PNG, by the file's suffix.
-
-    Returns:
-        Description of the file that was written.
+    """Write a poster as PDF or PNG, by the file's suffix; returns a description of the file.
 
     Raises:
         PrintError: The file is of another kind, or the measures do not fit together.

@@ -50,9 +50,8 @@ def parse_request(text: str, source: str = "request", folder: Path | None = None
     """Check the text of a request; returns it as the folder of its search stores it.
 
     Args:
-        text: Text of an experiment file; its paths are absolute, or relative to ``folder``.
         source: Name of the text in messages.
-        folder: The working folder if it is None.
+        folder: Folder that its paths are relative to; None for the working folder.
 
     Raises:
         ConfigError: The text has an error, which is reported with its line and the valid keys.

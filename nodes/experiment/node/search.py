@@ -78,13 +78,10 @@ def run_attack(
     on_evaluation: OnEvaluation | None = None,
     on_prepared: Callable[[Prepared], None] | None = None,
 ) -> list[Path]:
-    """Run every seed of a request in a folder, resuming an interrupted run.
+    """Run every seed of a request in a folder, which stores the request too, resuming an interrupted run.
 
     Args:
-        experiment: The requested experiment; it is stored in the folder.
-        folder: Folder for states and attack files.
-        display: Progress display of each seed.
-        on_evaluation: Also called after every evaluation.
+        on_evaluation: Called after every evaluation, besides the display.
         on_prepared: Called before the search of each seed.
 
     Returns:

@@ -44,14 +44,12 @@ def gather(
     overview: NDArray[np.uint8] | None,
     memory_mib: Mapping[int, float],
 ) -> rd.ReportData:
-    """All data of the page.
+    """All data of the page of an experiment with all earlier stages and cells finished.
 
     Args:
-        experiment: Experiment with all earlier stages and cells finished.
         films: Films by scenario.
         seen: Camera images of the objects, by scenario and method.
         done: Summary of the searches and drives, in one paragraph.
-        overview: The world from above.
         memory_mib: Memory of the adjoint by horizon, if it was measured [MiB].
     """
     live = experiment.config.deploy.live

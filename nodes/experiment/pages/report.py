@@ -51,11 +51,7 @@ _LOOKED_AT, _SHOWN = 12, 2
 def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[str] = ()) -> None:
     """Write ``report.html``, ``table.json``, ``table.csv``, ``table.md`` and a film of each drive; for live drives also measurements from their bags.
 
-    Args:
-        experiment: Experiment with all earlier stages finished, and all cells of its methods.
-        folder: Output folder.
-        report: Progress callback.
-        notes: Paragraphs at the top of the page, such as missing methods.
+    All earlier stages, and all cells of the experiment's methods, are finished. Notes are paragraphs at the top of the page.
     """
     from advnerf_core.report.sections import page_sections  # matplotlib
 

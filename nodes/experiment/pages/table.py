@@ -43,20 +43,12 @@ def write_table(
     first: FirstScreen | None = None,
     notes: Sequence[str] = (),
 ) -> Path:
-    """Write JSON, CSV, Markdown and the page with the clips beside it.
+    """Write JSON, CSV, Markdown and the page with the clips beside it; returns the page.
 
     Args:
-        table: The table.
-        cells_folder: Folder of the cells' clips.
-        folder: Output folder.
         sections: Further parts of the page.
-        page: Name of the page.
-        targets: Targets of the results.
         first: Contents of the first screen; None for the sentences of the table alone.
         notes: Paragraphs before the sentence, such as missing methods.
-
-    Returns:
-        The page.
     """
     folder.mkdir(parents=True, exist_ok=True)
     clips = gather_clips(table, cells_folder, folder)

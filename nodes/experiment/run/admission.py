@@ -20,11 +20,7 @@ def past_the_gate(
 ) -> list[Cell]:
     """The cells whose surrogate is good enough; judged once per variant, path and victim, and stored.
 
-    Args:
-        experiment: The experiment.
-        cells: The cells to judge.
-        leave_out: Whether cells of a rejected surrogate are left out; else there is only a warning.
-        say: Called with a message for every rejection.
+    Every rejection is said; unless ``leave_out`` is set, it is only a warning.
     """
     passed: dict[str, bool] = {}
     for cell in cells:

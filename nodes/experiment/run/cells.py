@@ -76,9 +76,7 @@ def run_cell(
 
     Args:
         experiment: Experiment with finished scene, objects and policies (``advnerf experiment run FILE --until policy``).
-        cell: The cell to run.
         folder: Folder of this cell, for search state, attack file, drives and film.
-        report: Called with the finished fraction.
         bench: Common resources of cells; None makes them.
 
     Returns:
@@ -105,10 +103,7 @@ def run_cell(
 def search_cell(
     experiment: Experiment, cell: Cell, folder: Path, report: Report, bench: Bench | None = None
 ) -> Path:
-    """The part of `run_cell` without deployment: search and drive in the surrogate.
-
-    Returns:
-        The folder of the same drive without attack.
+    """The part of `run_cell` without deployment: search and drive in the surrogate; returns the folder of the same drive without attack.
 
     Raises:
         CellError: The experiment has no such drive, victim or method.

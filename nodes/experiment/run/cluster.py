@@ -74,7 +74,6 @@ def run_on_ray(
     Args:
         work: Function of one job, which runs in a worker and returns something else than None.
         jobs: The jobs, as plain data.
-        at_a_time: Largest number of jobs that run at once.
 
     Yields:
         Each finished job, with the result; None if its machine was lost.

@@ -55,10 +55,7 @@ def cached_verdict(
     """The verdict on held-out views, or on a drive; judged again only if scene, policy or limits changed.
 
     Args:
-        experiment: The experiment of the cell.
         cell: The cell without attack that has the drive, with its name in the experiment.
-        limits: Required fidelity.
-        file: File of the verdict.
         drive: Folder of the cell, if its drive is to be judged.
 
     Raises:
@@ -103,10 +100,7 @@ def predict_cell(
     """Predict the deployed drives of a cell whose search is finished, from pictures and the surrogate alone.
 
     Args:
-        experiment: The experiment of the cell.
         cell: The cell, with its name in the experiment.
-        folder: The cell's folder.
-        draws: Drives per prediction.
         clean: The second result of an earlier prediction of the same scenario, victim, seed and draws.
 
     Returns:

@@ -17,26 +17,12 @@ FOLDER = "attacks"
 
 
 def attack_file(folder: Path, attack_id: str) -> Path:
-    """File of an attack in a published set.
-
-    Args:
-        folder: Folder of the set.
-        attack_id: Short hash of the attack.
-    """
+    """File of an attack, by its short hash, in the folder of a published set."""
     return folder / FOLDER / f"{attack_id}.safetensors"
 
 
 def publish_attacks(experiment: Experiment, found: Sequence[CellStatus], folder: Path) -> list[Path]:
-    """Copy the attacks of finished cells that this machine has.
-
-    Args:
-        experiment: The experiment.
-        found: States of its cells.
-        folder: Folder of the published set.
-
-    Returns:
-        The new files there.
-    """
+    """Copy the attacks of finished cells that this machine has into the folder of a published set; returns the new files there."""
     written = []
     for each in found:
         if each.state != "done" or each.result is None or not is_published_with_its_attack(each.result):

@@ -15,12 +15,7 @@ from nodes.runtime.progress import ProgressDisplay
 
 
 def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int | None = None) -> list[Path]:
-    """Draw the maps of all finished cells; existing ones are read from their files.
-
-    Args:
-        experiment: The experiment.
-        cells: Cells whose maps are drawn.
-        number: Number of the moved object; None: the experiment's choice.
+    """Draw the maps of all finished cells; existing ones are read from their files. Without a number the experiment says which object is moved.
 
     Raises:
         ConfigError: No cell is finished, or none has placed objects.

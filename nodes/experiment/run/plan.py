@@ -39,13 +39,7 @@ def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Job]:
 
 
 def registered_under(registration: Registration | None, cell: Cell, settings: Settings) -> str:
-    """Digest of the registration of a cell; empty if it is not registered with these settings.
-
-    Args:
-        registration: Registration of the experiment; None without one.
-        cell: The cell.
-        settings: Settings of its variant from `registered_settings`.
-    """
+    """Digest of the registration of a cell; empty if it is not registered with these settings, its variant's `registered_settings`."""
     if registration is None or registered_cell(cell) not in registration.cells:
         return ""
     scenario = registration.scenario(cell.scenario)

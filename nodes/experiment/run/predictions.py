@@ -30,13 +30,7 @@ def predict_cells(
     """Predict every attacked cell with a search and without a prediction; returns their number.
 
     A prediction needs the finished search (``advnerf experiment run --search-only`` does only that) and the drive without attack. It reads
-    no drive with the attack, so it is the same before and after that drive.
-
-    Args:
-        experiment: The experiment.
-        cells: Cells of the experiment.
-        say: Called with a message for each prediction, and for each that was not possible.
-        draws: Drives per prediction; None uses `DEFAULT_DRAWS`.
+    no drive with the attack, so it is the same before and after that drive. What was predicted, and what could not be, is said.
     """
     from nodes.experiment.run.gate import DEFAULT_DRAWS, lacks, predict_cell  # loads torch
 
@@ -75,12 +69,7 @@ def predict_cells(
 
 
 def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
-    """Predictions of finished cells, each with the measured values.
-
-    Args:
-        folder: Folder of the experiment, or of its published set.
-        results: Finished cells of the experiment.
-    """
+    """Predictions of finished cells, each with the measured values, from the folder of an experiment or of its published set."""
     pairs, drives = [], CellDrives(results)
     for cell in results:
         kept = kept_prediction(prediction_file(folder, cell.name), cell.settings_hash)

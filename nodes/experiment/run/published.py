@@ -51,15 +51,10 @@ class Published:
 def publish(
     experiment: Experiment, found: Sequence[CellStatus], folder: Path, prune: bool = False
 ) -> Published:
-    """Copy finished cells to the folder stored with the code, with the fidelity gate's verdicts and the predictions of these cells.
+    """Copy finished cells to the experiment's folder in ``folder``, with the fidelity gate's verdicts and the predictions of these cells.
 
-    Cells there that are not finished here stay: they may have been run on another machine.
-
-    Args:
-        experiment: The experiment.
-        found: States of its cells.
-        folder: Folder for one folder per experiment.
-        prune: Remove cells there whose results here have other settings too.
+    Cells there that are not finished here stay: they may have been run on another machine. With ``prune`` those whose results here have other
+    settings too are removed.
     """
     written, same, stale = [], [], []
     for each in found:
@@ -115,13 +110,9 @@ class PublishedBuild:
 def publish_build(
     experiment: Experiment, cells: Sequence[Cell], folder: Path, prune: bool = False
 ) -> PublishedBuild:
-    """Copy the scenes, victims and objects of an experiment into the reference build.
+    """Copy the scenes, victims and objects of an experiment's cells into the reference build beside the published sets.
 
-    Args:
-        experiment: The experiment.
-        cells: Cells whose stages are copied.
-        folder: Folder of the published set.
-        prune: Remove stages there that no cell published in ``folder`` was run with.
+    With ``prune`` stages there are removed that no cell published in ``folder`` was run with.
     """
     reference = ReferenceBuild(folder / BUILD)
     variants = {each.variant: experiment.of(each) for each in cells}
@@ -181,12 +172,7 @@ def _publish_hardness(experiment: Experiment, folder: Path) -> None:
 
 
 def published_table(folder: Path, experiment: Experiment, cells: Sequence[Cell] | None = None) -> ResultTable:
-    """The table of published cells, with all requested lines and seeds.
-
-    Args:
-        folder: Folder of the published cells.
-        experiment: Experiment of the cells.
-        cells: Cells of the table; None for all.
+    """The table of published cells in a folder, with all requested lines and seeds; all cells of the experiment if none are given.
 
     Raises:
         ConfigError: The folder has no cells.
@@ -202,11 +188,6 @@ def published_table(folder: Path, experiment: Experiment, cells: Sequence[Cell] 
 
 
 def table_of(experiment: Experiment, found: Sequence[CellStatus]) -> ResultTable:
-    """The table of existing cells.
-
-    Args:
-        experiment: The experiment.
-        found: States of the table's cells; only results with the current settings are used.
-    """
+    """The table of existing cells; only results with the current settings are used."""
     cells = [each.result for each in found if each.result is not None and each.state in FINISHED]
     return make_table(wanted_rows([each.cell for each in found]), cells, experiment.config.name)

@@ -62,14 +62,9 @@ class Redriven:
 def redrive(
     experiment: Experiment, published: Path, count: int, seed: int, tell: Callable[[str], None]
 ) -> list[Redriven]:
-    """Drive some cells of a set again, in the surrogate, with the published scene, victim and attacks.
+    """Drive some cells of a set again, drawn at random, in the surrogate, with the published scene, victim and attacks.
 
-    Args:
-        experiment: The registered experiment, with a run folder that may be empty.
-        published: Folder of the set.
-        count: Number of cells, drawn at random.
-        seed: Seed of the draw.
-        tell: Called with a message for each cell.
+    The run folder of the registered experiment may be empty.
 
     Raises:
         RedriveError: The set's scene and victim are not published, or this version would drive differently.
@@ -92,12 +87,7 @@ def redrive(
 
 
 def unreadable(published: Path, why: str) -> RedriveError:
-    """The error for a set that this version reads differently from the one that published it.
-
-    Args:
-        published: Folder of the set.
-        why: The difference.
-    """
+    """The error for a published set that this version reads differently from the one that published it, and in what."""
     commit = last_commit(published)
     of = f", git checkout {commit[:12]}" if commit else ""
     return RedriveError(f"{published.name}: {why}; drive it again with the version that published it{of}")

@@ -40,12 +40,7 @@ from nodes.experiment.steps.verdicts import VALIDATED_ON, trained_on, unseen
 
 
 def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> Registration:
-    """Write the registration of an experiment.
-
-    Args:
-        experiment: The experiment.
-        cells: The cells to register.
-        published: Folder of all published sets; the file is written to a folder with the experiment's name.
+    """Write the registration of an experiment into its folder among all published sets.
 
     Raises:
         RegistrationError: Another registration has this name, cells with these settings were run already, or a test lacks baselines.
@@ -89,12 +84,7 @@ def _scenarios(experiment: Experiment, cells: Sequence[Cell]) -> dict[str, Regis
 
 
 def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario:
-    """The registration of one path of an experiment.
-
-    Args:
-        experiment: Experiment with known world and victims.
-        name: Name of the path in the experiment.
-    """
+    """The registration of one path of an experiment, whose world and victims are known."""
     config, limits = experiment.config, experiment.limits
     found = {name: given_victim(experiment, name) for name in given_in(config)}
     settings, own = registered_settings(experiment), own_recipes(config)

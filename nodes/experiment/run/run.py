@@ -69,18 +69,12 @@ def run_cells(
     console: Console | None = None,
     watcher: StageDisplay | None = None,
 ) -> list[Ended]:
-    """Run the cells that are not finished yet.
+    """Run the cells that are not finished yet; returns how each of them ended, in the order of their ends.
 
     Args:
-        experiment: The experiment.
-        cells: The cells to run.
-        options: Backend, number of parallel cells and further options.
         say: Called with a message for every start and end.
         console: Console for the progress of cells in this process.
-        watcher: Also receives the progress of cells in this process.
-
-    Returns:
-        How every cell that was run ended, in the order of their ends.
+        watcher: Also receives that progress.
 
     Raises:
         ConfigError: A variant is wrong; nothing was run.

@@ -99,7 +99,6 @@ class Store:
         """State of a cell.
 
         Args:
-            cell: The cell.
             settings_hash: Hash of the current settings; None if it is unknown yet, because the cell's inputs do not exist.
             elsewhere: Further files that may have this cell's result: one with the same key counts as finished.
         """

@@ -41,19 +41,14 @@ def run_experiment(
     anew: bool = False,
     record: ProgressRecord | None = None,
 ) -> list[Ended]:
-    """Run the unfinished stages and cells, and the report, which leaves out methods with a failed cell.
+    """Run the unfinished stages and cells, and the report, which leaves out methods with a failed cell; returns how every cell that was run ended.
 
     Args:
-        experiment: The experiment.
         until: Last stage to run; None for all, and the cells.
         options: Options for running cells; None runs one after another in this process.
         only: Selection of cells, see `select`.
-        console: Console to print to.
         anew: Whether to make stages here that are stored with the code.
         record: Progress record for the experiment page.
-
-    Returns:
-        How every cell that was run ended.
 
     Raises:
         StageError: ``until`` names no stage.

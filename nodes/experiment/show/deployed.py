@@ -283,13 +283,8 @@ def drive_deployed(
     """Drive once through the attacked scene, tick by tick.
 
     Args:
-        dressed: The scene with its objects.
-        policy: The victim.
         goal: Goal vector; empty without a goal.
         start: Pose ``[3]``.
-        path: Reference path.
-        limits: Ticks and limits.
-        car: Dynamics of the drive.
         theta: The objects' colours; None for no objects.
         camera: Imperfect camera; None for an ideal one.
     """

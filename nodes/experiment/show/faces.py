@@ -74,7 +74,6 @@ def face_space(
     """The colours of the face in the learned scene.
 
     Args:
-        experiment: Experiment with a learned scene.
         background: Renderer of the scene, if it is loaded already.
         ideal: Whether a screen is assumed ideal; None uses the experiment's setting.
     """

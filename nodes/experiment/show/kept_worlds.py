@@ -58,12 +58,7 @@ def is_users(section: Mapping[str, Any]) -> bool:
 
 
 def keep_worlds(folder: Path, worlds: Iterable[tuple[dict[str, Any], NamedWorld]]) -> None:
-    """Store the facts about users' worlds in a run folder.
-
-    Args:
-        folder: The run folder.
-        worlds: Sections of the experiment file, and the worlds that they name.
-    """
+    """Store the facts about users' worlds, each with the section of the experiment file that names it, in a run folder."""
     found = [
         KeptWorld(section, world.source_sha256, world.settings, world.traits, _description(world)).to_dict()
         for section, world in worlds
@@ -88,12 +83,7 @@ def _description(world: NamedWorld) -> WorldDescription | None:
 
 
 def kept_world(folder: Path, section: Mapping[str, Any], beside: Path) -> KeptWorld:
-    """Stored facts about the world of a section; nothing of it is executed.
-
-    Args:
-        folder: The run folder.
-        section: The section of the experiment file.
-        beside: Folder that a relative ``file.py:Class`` is relative to.
+    """Stored facts about the world of a section in a run folder; nothing of it is executed. ``file.py:Class`` is relative to ``beside``.
 
     Raises:
         WorldUnknownError: No facts are stored for this section with this code.

@@ -54,15 +54,9 @@ def scene_sha256(experiment: Experiment) -> str:
 
 
 def compare_views(experiment: Experiment, view: PolicyView, begin: float, report: Report) -> None:
-    """Write ``fidelity.json`` and pictures of true and learned views into the scene's folder.
+    """Write ``fidelity.json`` and pictures of true and learned views into the scene's folder; ``begin`` is the share of the stage before.
 
     PSNR and SSIM are taken at the camera's size and at the policy's: there the field's own render against the resized image.
-
-    Args:
-        experiment: Experiment with captured and learned scene.
-        view: The policy's view of the driving camera.
-        begin: Share of the stage that is finished already.
-        report: Progress callback.
     """
     folder, renderer = experiment.stage_folder("scene"), load_field(experiment)
     listed = _held_out(experiment)

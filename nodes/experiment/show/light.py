@@ -43,11 +43,7 @@ def light_on_panels(experiment: Experiment) -> DisplayModel | None:
 
 
 def measure_light(experiment: Experiment, world: World) -> DisplayFit:
-    """Show plain colours on the panel, look at them along the drive, and fit the response.
-
-    Args:
-        experiment: Experiment with one placed panel.
-        world: The open world; it has no panel afterwards.
+    """Show plain colours on the one placed panel, look at them along the drive, and fit the response. The panel is taken away afterwards.
 
     Raises:
         ConfigError: No drive sees the panel large enough.

@@ -33,13 +33,7 @@ from nodes.runtime.errors import ConfigError
 def stand_in(
     experiment: Experiment, scene: World, objects: Sequence[ColouredObject], native: bool
 ) -> Dressed:
-    """An open deployment scene with objects in it: composed by depth, or in the world's own scene.
-
-    Args:
-        experiment: The experiment whose objects they are.
-        scene: The open scene.
-        objects: All objects of the experiment, or none.
-        native: Whether they stand in the world's own scene.
+    """An open deployment scene with all objects of the experiment, or none: composed by depth, or, if ``native``, in the world's own scene.
 
     Raises:
         ConfigError: The world does not take them.

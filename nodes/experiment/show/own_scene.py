@@ -67,14 +67,7 @@ def flat_object(
     T_world_from_face: Array | None = None,
     resolution: int | None = None,
 ) -> VoxelGridObject:
-    """A panel or cube with a face.
-
-    Args:
-        experiment: The experiment, for what its panels have in common.
-        thing: The panel or cube.
-        T_world_from_face: Another pose ``[4, 4]`` of its face than its own.
-        resolution: Another number of colours along an edge than its own.
-    """
+    """A panel or cube with a face: at its own pose or another one ``[4, 4]``, and with its own number of colours along an edge or another one."""
     of_all, face = experiment.config.object, thing.face or FaceConfig()
     field = cube_face_object(
         face.size_m,

@@ -42,11 +42,7 @@ class SeenFrom:
 
 
 def place_by_rule(experiment: Experiment, world: World) -> list[PlacedObject]:
-    """All objects of an experiment, with the places of those that have a rule.
-
-    Args:
-        experiment: Experiment whose world is described.
-        world: The same world, open.
+    """All objects of an experiment, with the places of those that have a rule in its open world.
 
     Raises:
         ConfigError: No spot fits the rule.

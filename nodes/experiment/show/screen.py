@@ -61,8 +61,6 @@ def measure_display(
 
     Args:
         world: The open world; its screen shows the last colour afterwards.
-        name: Name of the screen.
-        panel: The screen.
         seed: Seed of the mixed colours.
         frames_of: Converts a rendered picture to camera frames, such as several noisy ones; None uses the picture itself.
     """

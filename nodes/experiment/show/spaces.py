@@ -59,11 +59,9 @@ def colour_space(experiment: Experiment, surrogate: Surrogate | None = None) -> 
 
 
 def make_space(experiment: Experiment, scene: World | None) -> Space:
-    """The space of the experiment's section ``space``.
+    """The space of the experiment's section ``space``; the open deployment scene is needed if `over_the_world`.
 
-    Args:
-        experiment: The experiment; its scene and objects must exist, except for meshes over the world's own pictures.
-        scene: The open deployment scene; needed if `over_the_world`.
+    The experiment's scene and objects must exist, except for meshes over the world's own pictures.
     """
     wanted = experiment.config.space
     if has_face(experiment):

@@ -38,15 +38,9 @@ def standing_in(world: World) -> tuple[Standing, ...]:
 
 
 def make_stand(world: World, wanted: Sequence[Standing], put: Callable[[int], None]) -> tuple[Standing, ...]:
-    """Have these objects in a world's own scene, and no others.
+    """Have these objects in a world's own scene, and no others; returns what `standing_in` says from now on.
 
-    Args:
-        world: The open world.
-        wanted: The objects.
-        put: Puts one of them there, by its number, in place of the one of its name.
-
-    Returns:
-        What `standing_in` says from now on.
+    ``put`` puts one of them there, by its number, in place of the one of its name.
     """
     standing = list(standing_in(world))
     names = {each[:2] for each in wanted}

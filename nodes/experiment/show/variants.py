@@ -100,15 +100,10 @@ def resolve(
     executes: bool,
     load: Callable[[Made, Document], Made],
 ) -> Made:
-    """Resolve an experiment file and its variants.
+    """Resolve an experiment file and its variants; see `nodes.experiment.steps.run.load_experiment`.
 
     Args:
         kind: Class of the result.
-        file: A ``*.experiment.yaml`` file.
-        setting: Name of the setting to lay over its values; None uses demo if it has settings.
-        overrides: ``section.key=value`` texts, applied last.
-        folder: The run folder; None uses the file's ``run_folder``, or else one under ``runs``.
-        executes: See `Variants`.
         load: Reads the world and the victims of an experiment without variants, or of one variant, given its values.
 
     Raises:

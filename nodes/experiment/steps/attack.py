@@ -52,14 +52,9 @@ _STATE = "state.safetensors"
 def surrogate_part(
     experiment: Experiment, space: Space, cell: Cell, folder: Path, report: Callable[..., None]
 ) -> dict[str, Any]:
-    """Search if the cell has a method, drive in the surrogate, and store both; existing parts are read.
+    """Search if the cell has a method, drive in the surrogate, and store both in its folder, as ``attack.safetensors`` and ``surrogate.json``.
 
-    Args:
-        experiment: The experiment.
-        space: The search space.
-        cell: The cell.
-        folder: Folder of the cell, for ``attack.safetensors`` and ``surrogate.json``.
-        report: Called with the finished fraction.
+    Existing parts are read.
 
     Returns:
         Attack id (None without an attack), states and metrics of the drives, the curve of the search [m], and its seconds.
@@ -95,13 +90,7 @@ def surrogate_part(
 
 
 def surrogate_drives(experiment: Experiment, space: Space, cell: Cell, folder: Path) -> dict[str, Any]:
-    """Drives in the surrogate from the measured starts, past the attack in a folder.
-
-    Args:
-        experiment: The experiment.
-        space: The search space.
-        cell: The cell; for a control no file is read.
-        folder: Folder with ``attack.safetensors``.
+    """Drives in the surrogate from the measured starts, past the ``attack.safetensors`` in a folder; for a control no file is read.
 
     Returns:
         States ``[S, T + 1, n]``, commands ``[S, T]`` and metrics, as JSON data.

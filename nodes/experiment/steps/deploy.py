@@ -79,10 +79,7 @@ def cell_data(
     """Drive a searched cell, and without attack, in the deployment, and assemble the result.
 
     Args:
-        experiment: The experiment.
-        space: The search space.
         place: The open world, or the live nodes; None deploys nothing.
-        cell: The cell.
         folder: The cell's folder, with the surrogate's part.
         clean: The folder of the same drive without attack, with the surrogate's part.
         tell: Called with a message for each drive that does not count.

@@ -31,11 +31,8 @@ _SAME = ("car", "camera", "T_car_from_camera", "off_track_m")
 
 
 def plans_elsewhere(experiment: Experiment, opened: ExitStack) -> list[SourcePlan]:
-    """Two sources for each drive of each place: half of the poses without any object, half with the objects at the places of their rule.
-
-    Args:
-        experiment: Experiment whose ``policy.learns_in`` names the places.
-        opened: Closes their worlds when the policy is trained.
+    """Two sources for each drive of each place that ``policy.learns_in`` names: half of the poses without any object, half with the objects at the
+    places of their rule. ``opened`` closes their worlds when the policy is trained.
 
     Raises:
         ConfigError: A place has another car or camera than the attacked one, lacks a path, or has no spot for an object.
@@ -50,12 +47,10 @@ def plans_elsewhere(experiment: Experiment, opened: ExitStack) -> list[SourcePla
 def place_elsewhere(
     experiment: Experiment, changes: Sequence[str], opened: ExitStack
 ) -> tuple[Experiment, World]:
-    """The experiment in another place, with its objects at the places of their rule there, and that place, open.
+    """The experiment in another place, with its objects at the places of their rule there, and that place, open until ``opened`` closes it.
 
     Args:
-        experiment: Experiment in the attacked place.
         changes: Changes of the section ``world``, in the form of ``--set``.
-        opened: Closes the world.
 
     Raises:
         ConfigError: The place has another car or camera, or no spot for an object.

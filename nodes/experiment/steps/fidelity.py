@@ -71,9 +71,7 @@ def driven(experiment: Experiment, cell: Cell, clean: Path, bag: Path | None = N
     """Images of the camera on the deployed drive without an attack.
 
     Args:
-        experiment: The experiment.
-        cell: Cell of the drive.
-        clean: Folder of its live drives without attack.
+        clean: Folder of the cell's live drives without attack.
         bag: Instead, a bag of any live drive without attack.
 
     Raises:

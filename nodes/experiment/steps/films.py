@@ -35,12 +35,8 @@ def film_scenario(
     """The drives without an attack, past the best random object and past the attacked one, side by side; first seed and start.
 
     Args:
-        experiment: Experiment with all earlier stages finished.
         scene: The open scene; None for live drives, whose bags have the pictures, and if nothing was deployed: then the film
             shows the learned scene as the policy sees it.
-        space: The search space.
-        scenario: Name of the path.
-        folder: Folder for the film.
     """
     _, rate_hz = filmed(experiment.config.dt_s)
     deployed, tracks = experiment.config.deploy.through != "nothing", []

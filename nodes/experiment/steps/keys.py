@@ -63,8 +63,6 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
     """Settings that a cell depends on: the resolved world (without a server's address), settings, and the outputs of the earlier stages.
 
     Args:
-        experiment: The experiment.
-        cell: The cell.
         deployed: Whether it is deployed too; else the search alone counts, which depends neither on the section ``deploy`` nor on world settings
             that change only how its own car moves (`Traits.unseen`).
 

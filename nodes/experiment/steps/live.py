@@ -87,10 +87,7 @@ def lab_of(experiment: Experiment) -> LabConfig:
 
 
 def check_live(experiment: Experiment, place: str) -> None:
-    """Check that live nodes can drive an experiment.
-
-    Args:
-        place: Where the section ``deploy`` is, for errors.
+    """Check that live nodes can drive an experiment; ``place`` is where its section ``deploy`` is, for errors.
 
     Raises:
         ConfigError: The world is not the lab, a lost frame would stop its car, or a change does not fit the launch file.
@@ -144,14 +141,7 @@ class LiveNodes:
         self.graph.close()
 
     def drive(self, live: LiveRun, plan: TrialPlan, more: Sequence[str], folder: Path) -> TrialOutcome:
-        """Drive one run; see `TrialNodes.drive`.
-
-        Args:
-            live: The run.
-            plan: The plan of the drive.
-            more: Further overrides of the launch file.
-            folder: Folder for ``trial.json`` and the bag.
-        """
+        """Drive one run, into a folder for ``trial.json`` and the bag, with more overrides of the launch file; see `TrialNodes.drive`."""
         experiment = self._experiment
         if not self.graph.pids:
             self._vicon_port = _free_udp_port()
@@ -168,15 +158,7 @@ def drive_until_it_counts(
     tell: Callable[[str], None],
     nodes: LiveNodes,
 ) -> dict[str, Any]:
-    """Drive one run until it counts; see `drive_with_tries` for its errors.
-
-    Args:
-        experiment: Experiment in the lab.
-        live: The run.
-        folder: Folder for its folder and its JSON; an existing run is read.
-        tell: Called with a message for each try that does not count.
-        nodes: The nodes.
-    """
+    """Drive one run until it counts, into its own folder and its JSON in ``folder``; an existing run is read. See `drive_with_tries` for errors."""
     file = folder / f"{live.name}.json"
     return drive_with_tries(lambda: drive_live(experiment, live, folder, nodes), file, tell)
 

@@ -62,9 +62,6 @@ def run(
     """Train the victims, then compare their controls on held-out views and on the surrogate's image of them.
 
     Args:
-        experiment: Experiment with a learned scene.
-        folder: Folder of the stage.
-        report: Progress callback.
         number_type: See `advnerf_core.learning.fit.fit`.
     """
     config = experiment.config.policy
@@ -137,8 +134,6 @@ def plans(
     """Frames for each drive from the deployment scene and from the surrogate, with its goal and its teacher.
 
     Args:
-        experiment: The experiment.
-        scene: The deployment scene.
         sample: Draws the colours of all objects ``[K, 3]``; None draws random ones.
         objects: The objects at their places; None uses the world's places.
         ending: Suffix of the sources' names, which distinguishes their frames.

@@ -60,13 +60,7 @@ class Mapped:
     def landscape(
         self, wanted: LandscapeConfig, number: int, file: Path, report: Report
     ) -> tuple[Landscape, Path]:
-        """Drive over a grid of one object's places.
-
-        Args:
-            wanted: The grid.
-            number: Number of the moved object.
-            file: A JSON file, where finished points are kept; the picture goes beside it.
-            report: Called with the finished fraction.
+        """Drive over a grid of one object's places; finished points are kept in a JSON file, and the picture goes beside it.
 
         Raises:
             PoseMapError: The object does not exist, or the file holds another map.
@@ -101,11 +95,8 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
     """Both maps about a finished cell, in the learned scene: the other objects keep the places of its attack, and all keep its colours.
 
     Args:
-        experiment: Experiment with finished scene and objects.
-        cell: The finished cell.
         number: Number of the moved object.
         folder: Folder of the cell, for ``landscape_<name>.json``, ``robustness_<name>.json`` and a PNG of each; it also stores finished points.
-        report: Called with the finished fraction.
 
     Returns:
         The pictures; none for a cell that moved no object.

@@ -24,12 +24,7 @@ def draw(file: Path, rounds: Sequence[dict[str, Any]], pays_ratio: float) -> Non
 
 
 def curve(rounds: Sequence[dict[str, Any]], pays_ratio: float) -> Figure:
-    """Ratio to no attack by round, surrogate dashed, deployed solid; and the stop ratio.
-
-    Args:
-        rounds: Ratios by domain and scenario, of the original policy and after each retraining.
-        pays_ratio: Stop ratio of the loop.
-    """
+    """Ratio to no attack of the original policy and after each retraining, surrogate dashed, deployed solid; and the ratio at which the loop stops."""
     figure = Figure(figsize=(8.0, 4.0), dpi=110)
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()

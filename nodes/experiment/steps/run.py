@@ -196,13 +196,6 @@ def make_ready(
     """Load existing victims, and run the unfinished stages that cells need. Stages stored with the code count as finished, unless
     ``anew`` is set.
 
-    Args:
-        experiment: The experiment, whose folder may have results of stages.
-        until: Last stage to run; None runs all.
-        console: Console of the progress.
-        anew: Whether to make stages here that are stored with the code.
-        watcher: Also receives the progress.
-
     Raises:
         ConfigError: The folder has the stages of another experiment, which would be replaced.
         AdvnerfError: A stage failed, or the policy's architecture cannot be built.

@@ -20,15 +20,9 @@ def search_key(experiment: Experiment, cell: Cell) -> str:
 
 
 def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
-    """Copy the search of a neighbouring cell if it is the same; nothing happens if this cell has begun its own.
+    """Copy the search of a cell whose folder is beside this one's if it is the same, and return that folder; None if this cell has begun its own.
 
-    Args:
-        experiment: Experiment whose stages before the cells are finished.
-        cell: The cell.
-        folder: Folder of this cell; the other cells' folders are beside it.
-
-    Returns:
-        The source folder.
+    The stages before the cells are finished.
     """
     settings = cell_settings(experiment, cell, deployed=False)
     key = settings.key

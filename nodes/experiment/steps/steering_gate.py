@@ -26,14 +26,10 @@ MOST_DIFFERENCE, LEAST_CORRELATION = 0.25, 0.9
 def require_same_steering(
     experiment: Experiment, may_go_on: bool = False, say: Callable[[str], None] = print
 ) -> None:
-    """Raise for a learned scene in which a victim steers differently from real pictures of the same places.
+    """Raise for a learned scene in which a victim steers differently from real pictures of the same places, where the key ``gate`` is ``steering``.
 
-    Of the victims that the section policy trains as it is the first one is judged, of all others each.
-
-    Args:
-        experiment: Experiment with scene and victims; it is judged if its key ``gate`` is ``steering``, the default.
-        may_go_on: Whether a rejection is only a warning.
-        say: Called with the warning.
+    Of the victims that the section policy trains as it is the first one is judged, of all others each. If the run may go on, a rejection is
+    only said, as a warning.
 
     Raises:
         RuntimeFault: The scene is rejected.
