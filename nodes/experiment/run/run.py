@@ -99,7 +99,6 @@ def run_cells(
             f"nothing to do: {'every cell is' if there == len(plan) else f'{there} of {len(plan)} cells are'} there"
         )
         return []
-    _require_positive(options)
     if options.here:
         return _run_here(store, wanted, experiment, options, say, ProgressDisplay(console, watcher))
     jobs, threads = _shares(options)
@@ -284,13 +283,6 @@ def _tell(end: Ended, say: Say) -> Ended:
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0))
-
-
-def _require_positive(options: Options) -> None:
-    if options.jobs < 0 or options.threads < 0:
-        raise ConfigError(
-            f"expected --jobs and --threads of at least 1, got {options.jobs} and {options.threads}"
-        )
 
 
 def _shares(options: Options) -> tuple[int, int]:
