@@ -34,9 +34,9 @@ from nodes.experiment.plan.object_kinds import name_of
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.overview import from_above
-from nodes.experiment.show.spaces import dress, make_space, shown_there
+from nodes.experiment.show.spaces import make_space
 from nodes.experiment.steps import films, memory
-from nodes.experiment.steps.attack import load_found, load_shown, planned_evaluations
+from nodes.experiment.steps.attack import dress_cell, load_shown, planned_evaluations
 from nodes.experiment.steps.keys import driven_folder
 from nodes.runtime.progress import Report
 
@@ -154,12 +154,7 @@ def textures_seen(
     seen = {}
     for method in (NONE, *experiment.config.method_names):
         cell = Cell(scenario, experiment.config.main_victim, method, seed)
-        folder = driven_folder(experiment, cell)
-        shown = load_shown(space, folder, cell)
-        dressed, colours = (
-            dress(experiment, scene, shown),
-            shown_there(experiment, shown, load_found(folder, cell)),
-        )
+        dressed, colours = dress_cell(experiment, scene, space, driven_folder(experiment, cell), cell)
         seen[method] = np.concatenate([dressed.camera_image(state, colours) for state in states], axis=1)
     return seen
 

@@ -26,6 +26,7 @@ from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.report.conditions import EMPTY
+from hardware.worlds.world import World
 from nodes.experiment.engine.artefact import Settings, hash_of
 from nodes.experiment.engine.telling import telling
 from nodes.experiment.plan.cell import Cell
@@ -37,9 +38,10 @@ from nodes.experiment.plan.space_config import (
     PlacesConfig,
 )
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.drives import learned_drives, totals
 from nodes.experiment.show.learned_scene import baked_file, load_field, scene_sha256
-from nodes.experiment.show.spaces import over_the_world
+from nodes.experiment.show.spaces import dress, over_the_world, shown_there
 from nodes.experiment.show.victims import load_victim, told
 from nodes.experiment.steps.frozen import frozen_for, hardness_before
 from nodes.experiment.steps.keys import registered_settings
@@ -194,6 +196,14 @@ def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
         return Shown((), torch.zeros(0, 3))
     attack = load_found(folder, cell)
     return space.plain if attack is None else space.restored(attack)
+
+
+def dress_cell(
+    experiment: Experiment, scene: World, space: Space, folder: Path, cell: Cell
+) -> tuple[Dressed, torch.Tensor | None]:
+    """An open deployment scene with the attacked objects of a cell, and what they show there, see `shown_there`."""
+    shown = load_shown(space, folder, cell)
+    return dress(experiment, scene, shown), shown_there(experiment, shown, load_found(folder, cell))
 
 
 def load_found(folder: Path, cell: Cell) -> AttackFile | None:

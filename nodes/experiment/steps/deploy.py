@@ -19,9 +19,8 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive
 from nodes.experiment.show.drives import deployed_drives, totals
-from nodes.experiment.show.spaces import dress, shown_there
 from nodes.experiment.show.victims import load_victim
-from nodes.experiment.steps.attack import load_found, load_shown
+from nodes.experiment.steps.attack import dress_cell
 from nodes.experiment.steps.live import LiveNodes, LiveRun, as_drive, drive_until_it_counts
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED, THETA
 from nodes.lab.trials.tries import NotDrivenError
@@ -33,14 +32,9 @@ def _through_world(
     experiment: Experiment, scene: World, space: Space, cell: Cell, folder: Path
 ) -> list[DeployedDrive]:
     """One drive per start by the open world's own car, tick by tick."""
-    policy = load_victim(experiment, cell.victim).policy
-    shown = load_shown(space, folder, cell)
-    there = dress(experiment, scene, shown)
-    starts, colours = (
-        deployed_starts(experiment, cell),
-        shown_there(experiment, shown, load_found(folder, cell)),
-    )
-    return deployed_drives(experiment, there, policy, cell.scenario, starts, colours)
+    policy, starts = load_victim(experiment, cell.victim).policy, deployed_starts(experiment, cell)
+    dressed, colours = dress_cell(experiment, scene, space, folder, cell)
+    return deployed_drives(experiment, dressed, policy, cell.scenario, starts, colours)
 
 
 def _through_nodes(

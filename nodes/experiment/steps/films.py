@@ -18,8 +18,7 @@ from hardware.worlds.world import World
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.images import as_uint8
-from nodes.experiment.show.spaces import dress, shown_there
-from nodes.experiment.steps.attack import load_found, load_shown
+from nodes.experiment.steps.attack import dress_cell, load_shown
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.keys import driven_folder
 from nodes.experiment.steps.search_files import SEARCHED
@@ -93,11 +92,7 @@ def _deployed_track(
         views = list(evaluation.frames(folder / live["run"] / "bag", began_ns, len(states), period_s))
         note = live["outcome"]["stopped_early"] or "ended"
         return _track(experiment, cell, title, views, states, "".join(live["attack_ids"]), note)
-    shown = load_shown(space, folder, cell)
-    dressed, colours = (
-        dress(experiment, scene, shown),
-        shown_there(experiment, shown, load_found(folder, cell)),
-    )
+    dressed, colours = dress_cell(experiment, scene, space, folder, cell)
     return _track(experiment, cell, title, [dressed.camera_image(state, colours) for state in states], states)
 
 
