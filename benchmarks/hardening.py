@@ -34,8 +34,8 @@ def main() -> None:
 
 
 def _judge(run: Path, victim: str, textures: int) -> None:
+    from benchmarks.victim_hardness import judge
     from nodes.experiment.show.context import Experiment
-    from nodes.experiment.steps.hardening import judge
 
     experiment = Experiment.resolved_in(run.resolve())
     verdict = judge(experiment, victim, textures)

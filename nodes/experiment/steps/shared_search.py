@@ -20,9 +20,9 @@ def search_key(experiment: Experiment, cell: Cell) -> str:
 
 
 def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
-    """Copy the search of a cell whose folder is beside this one's if it is the same, and return that folder; None if this cell has begun its own.
+    """Copy the search of a cell whose folder is beside this one's if it is the same, and return that folder.
 
-    The stages before the cells are finished.
+    Nothing happens if this cell has begun its own. The stages before the cells are finished.
     """
     settings = cell_settings(experiment, cell, deployed=False)
     key = settings.key

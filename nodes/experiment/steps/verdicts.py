@@ -1,4 +1,4 @@
-"""Families of random textures that train and judge a victim, and the verdicts in a run folder; `nodes.experiment.steps.hardening` makes these."""
+"""Families of random textures that train and judge a victim, and the verdicts in a run folder; `benchmarks.hardening` makes these."""
 
 from __future__ import annotations
 
