@@ -28,9 +28,9 @@ from advnerf_core.policies.network import Policy, images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import PoseBatch, Surrogate
 from hardware.cameras.effects import ImperfectCamera
-from hardware.worlds.world import Depth, Rgb, World, collided_with, require_depth
+from hardware.worlds.world import Rgb, World, collided_with, require_depth
 from nodes.experiment.show.images import as_uint8
-from nodes.experiment.show.standing import clear
+from nodes.experiment.show.standing import bare_views, clear
 
 # At a camera's own resolution a rasteriser takes one ray per pixel; the policy's resize averages three of them.
 _SUPERSAMPLE = 1
@@ -84,34 +84,23 @@ class DressedScene(Dressed):
 
     Args:
         scene: The scene without objects.
-        view: The policy's view of its camera.
         objects: The objects, opaque; none for the empty scene. As in the learned scene, only surfaces nearer than they are by
             `Surrogate.depth_tolerance_m` hide them: 0.15 m, so that they do not flicker where they touch the ground.
     """
 
     def __init__(self, scene: World, view: PolicyView, objects: Sequence[ColouredObject]) -> None:
         self.scene, self.view = scene, view
-        self._window = Surrogate(
-            self._observed,
-            view.window_pinhole,
-            scene.T_car_from_camera,
-            objects,
-            supersample=_SUPERSAMPLE,
-            opaque=True,
+        self._window, self._whole = (
+            Surrogate(
+                self._observed,
+                pinhole,
+                scene.T_car_from_camera,
+                objects,
+                supersample=_SUPERSAMPLE,
+                opaque=True,
+            )
+            for pinhole in (view.window_pinhole, view.camera)
         )
-        self._whole = Surrogate(
-            self._observed,
-            view.camera,
-            scene.T_car_from_camera,
-            objects,
-            supersample=_SUPERSAMPLE,
-            opaque=True,
-        )
-
-    @property
-    def theta_shape(self) -> tuple[int, ...]:
-        """Shape of the objects' colours."""
-        return self._window.theta_shape
 
     def plain_theta(self) -> Tensor:
         """The objects' own colours."""
@@ -151,18 +140,11 @@ class DressedScene(Dressed):
 
     def _observed(self, poses: Array, pinhole: Pinhole) -> tuple[Tensor, Tensor]:
         """The scene as a background renderer: the part of the camera image within the pinhole."""
-        T_camera_from_car = np.linalg.inv(self.scene.T_car_from_camera)
         top, left = round(self.view.camera.cy - pinhole.cy), round(self.view.camera.cx - pinhole.cx)
         kept = slice(top, top + pinhole.height), slice(left, left + pinhole.width)
-        clear(self.scene)
-        rgb: list[Rgb] = []
-        depth_m: list[Depth] = []
-        for pose in poses @ T_camera_from_car:
-            yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
-            image, depth = require_depth(self.scene.observe_at(float(pose[0, 3]), float(pose[1, 3]), yaw))
-            rgb.append(image[kept])
-            depth_m.append(depth[kept])
-        return torch.from_numpy(np.stack(rgb)) / 255.0, torch.from_numpy(np.stack(depth_m))
+        seen = [(rgb[kept], depth_m[kept]) for rgb, depth_m in bare_views(self.scene, poses)]
+        rgb, depth_m = (torch.from_numpy(np.stack(each)) for each in zip(*seen, strict=True))
+        return rgb / 255.0, depth_m
 
 
 class SelfDriving:
@@ -199,7 +181,6 @@ class IdealDriving:
     """The surrogate's car in a scene that is only rendered: it follows its commands exactly, and only the fence stops it.
 
     Args:
-        dynamics: The surrogate's car.
         fence_m: Beyond this abs(x) or abs(y) the car counts as blocked [m]; None without a fence.
     """
 

@@ -113,11 +113,6 @@ class PaintedScene(Dressed):
     """A deployment scene with a face on its panel, as the policy sees it.
 
     A board's face is drawn by the same code as live; a screen shows it, and the scene is rendered again, as no projection models its optics.
-
-    Args:
-        experiment: Experiment of the face.
-        scene: The open scene.
-        texture_px: Size of the texture that is shown.
     """
 
     def __init__(self, experiment: Experiment, scene: World, texture_px: int = TEXTURE_PX) -> None:

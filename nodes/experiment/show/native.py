@@ -52,8 +52,6 @@ class NativeScene(Dressed):
     """A deployment scene whose own renderer shows the attacked objects.
 
     Args:
-        scene: The open scene.
-        view: The policy's view of its camera.
         objects: The objects, at their places; none removes all.
         surfaces: The mesh that each object of voxels was made of, None for panels and meshes; empty if there are only these.
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from hardware.worlds.world import NativeMeshes, NativePanels, Panel, World
+from advnerf_core.geometry import Array, yaw_of
+from hardware.worlds.world import Depth, NativeMeshes, NativePanels, Panel, Rgb, World, require_depth
 
 
 class Standing(NamedTuple):
     """An object in a world's own scene.
 
     Attributes:
-        name: Its name there.
         is_mesh: Whether it is a mesh; else it is a panel.
         shape: Everything that it depends on except its colours.
-        texture: Its texture.
     """
 
     name: str
@@ -61,6 +60,13 @@ def clear(world: World) -> None:
     """Take out all that was put into a world's own scene."""
     if standing_in(world):
         make_stand(world, (), lambda number: None)
+
+
+def bare_views(world: World, poses: Array) -> Iterator[tuple[Rgb, Depth]]:
+    """Pictures and depth [m] of a world without anything put into it, at camera poses ``[B, 4, 4]`` of a car on the ground; time does not pass."""
+    clear(world)
+    for pose in poses @ np.linalg.inv(world.T_car_from_camera):
+        yield require_depth(world.observe_at(float(pose[0, 3]), float(pose[1, 3]), yaw_of(pose)))
 
 
 def _take_out(world: World, thing: Standing) -> None:

@@ -127,7 +127,7 @@ def test_an_ideal_car_does_what_it_is_told_in_any_world(make_wall: Any, car: Vox
         seen.append(images)
         return torch.full((1,), 0.4)
 
-    colours = torch.full(there.theta_shape, 9.0)
+    colours = torch.full_like(there.plain_theta(), 9.0)
     ideal = IdealDriving(Dubins(6.0, 0.1), fence_m=None)
     again = drive_deployed(there, watching, (0.4,), np.zeros(3), STRAIGHT, limits, ideal, colours)
     assert again.blocked_tick is None

@@ -60,7 +60,7 @@ def test_a_panel_stands_where_a_drive_sees_it_for_two_seconds(lab: Lab, tmp_path
     there, alone = (
         DressedScene(scene, experiment.view, placed_objects(experiment)) for scene in (lab, _Nothing(lab))
     )
-    colours = torch.full(there.theta_shape, 0.0)
+    colours = torch.full_like(there.plain_theta(), 0.0)
     colours[..., 0], colours[..., 1:] = 9.0, -9.0
     seen = []
     for tick in range(experiment.config.horizon + 1):
@@ -97,7 +97,7 @@ def test_the_largest_view_is_larger_than_any_other(lab: Lab, tmp_path: Path) -> 
         experiment = room(tmp_path / rule, f"{{seen_s: 1.5, choose: {rule}}}")
         placed(experiment, lab)
         alone = DressedScene(_Nothing(lab), experiment.view, placed_objects(experiment))
-        colours = torch.full(alone.theta_shape, 0.0)
+        colours = torch.full_like(alone.plain_theta(), 0.0)
         colours[..., 0], colours[..., 1:] = 9.0, -9.0
         path, start = experiment.paths["track"], lab.describe().paths["track"].drive_start
         begin_m = float(path.project(np.array(start[:2])).s_m)
