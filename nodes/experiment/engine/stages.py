@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TextIO
 
 from advnerf_core.errors import AdvnerfError
 from nodes.experiment.engine.artefact import (
@@ -183,7 +183,7 @@ def _run_or_reuse(
     key = key_of(stage, records)
     if (old := _finished(at, key, display)) is not None:
         return old
-    with _alone(at.folder):
+    with _lock(at.folder):
         # The process that held the lock may have made exactly this.
         if (old := _finished(at, key, display)) is not None:
             return old
@@ -200,18 +200,15 @@ def _finished(at: _Place, key: str, display: StageDisplay) -> Artefact | None:
     return record
 
 
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Lock a stage's folder, as two processes in it would write each other's files."""
+def _lock(folder: Path) -> TextIO:
+    """The lock of a stage's folder, as two processes in it would write each other's files."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     try:
-        lock = hold(folder.parent / f".{folder.name}.lock")
+        return hold(folder.parent / f".{folder.name}.lock")
     except HeldError as held:
         raise StageError(
             f"expected {folder} for this process alone, but process {held.owner} is at work there; wait for it, or name another run folder"
         ) from None
-    with lock:
-        yield
 
 
 def _go_on_or_begin(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from advnerf_core.attack.objectives import objective_key
 from advnerf_core.splats.scene_file import is_splat_scene, load_hash
@@ -62,10 +63,6 @@ _UNREAD_BY_RETRAIN: dict[str, Any] = {
 _TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "settings.json")
 
 
-class _Module(Protocol):
-    def run(self, experiment: Experiment, folder: Path, report: MeasuringReport, /) -> None: ...
-
-
 def stages_of(experiment: Experiment) -> list[Stage]:
     """The stages that cells need; the world must not have been opened for them. In a scene of the user's own, a splat is baked.
 
@@ -89,16 +86,13 @@ def stages_of(experiment: Experiment) -> list[Stage]:
 
 def _stage(
     name: str,
-    module: _Module,
+    run: Callable[[Experiment, Path, MeasuringReport], None],
     experiment: Experiment,
     settings: Settings,
     after: Sequence[str] = (),
     **others: Any,
 ) -> Stage:
-    def work(folder: Path, report: MeasuringReport) -> None:
-        module.run(experiment, folder, report)
-
-    return Stage(name, work, settings, after, VERSIONS[name.partition("-")[0]], **others)
+    return Stage(name, partial(run, experiment), settings, after, VERSIONS[name.partition("-")[0]], **others)
 
 
 def _capture(experiment: Experiment) -> Stage:
@@ -114,25 +108,25 @@ def _capture(experiment: Experiment) -> Stage:
     else:
         unread |= dict.fromkeys(("objects", "horizon", "dt_s"), True)
     settings = Settings.of(config, READS["capture"], unread, **inputs)
-    return _stage("capture", capture, experiment, settings, bulk=(capture.PHOTOS, capture.COLOUR_PAIRS))
+    return _stage("capture", capture.run, experiment, settings, bulk=(capture.PHOTOS, capture.COLOUR_PAIRS))
 
 
 def _scene(experiment: Experiment) -> Stage:
     settings = Settings.of(experiment.config, READS["scene"], view=experiment.view_settings)
     return _stage(
-        "scene", scene, experiment, settings, ("capture",), bulk=(VIEWS,), reads_bulk_of=("capture",)
+        "scene", scene.run, experiment, settings, ("capture",), bulk=(VIEWS,), reads_bulk_of=("capture",)
     )
 
 
 def _bake(experiment: Experiment) -> Stage:
     settings = Settings.of(experiment.config, READS["bake"], view=experiment.view_settings)
-    return _stage("bake", bake, experiment, settings, ("capture", "scene"))
+    return _stage("bake", bake.run, experiment, settings, ("capture", "scene"))
 
 
 def _bake_own(experiment: Experiment, file: Path) -> Stage:
     inputs = {"view": experiment.view_settings, "scene": load_hash(file), "world": experiment.world_settings}
     settings = Settings.of(experiment.config, READS["bake"], {"measure"}, **inputs)
-    return _stage("bake", bake, experiment, settings)
+    return _stage("bake", bake.run, experiment, settings)
 
 
 def _object(experiment: Experiment) -> Stage:
@@ -140,7 +134,7 @@ def _object(experiment: Experiment) -> Stage:
     settings = Settings.of(
         experiment.config, READS["object"], kinds=list(map(name_of, kinds)), files=files_of(kinds)
     )
-    return _stage("object", objects, experiment, settings)
+    return _stage("object", objects.run, experiment, settings)
 
 
 def _learned_from(experiment: Experiment) -> dict[str, Any]:
@@ -164,7 +158,9 @@ def _policy(name: str, experiment: Experiment) -> Stage:
     if not (isinstance(config.carrier, ScreenConfig) or config.policy.learns_in):
         unread["horizon"] = True
     settings = Settings.of(config, READS["policy"], unread, **_learned_from(experiment))
-    return _stage(name, policy, experiment, settings, ("capture", "scene", "object"), bulk=_TRAINING_FILES)
+    return _stage(
+        name, policy.run, experiment, settings, ("capture", "scene", "object"), bulk=_TRAINING_FILES
+    )
 
 
 def _retrain(experiment: Experiment, rounds: int) -> Stage:
@@ -185,7 +181,7 @@ def _retrain(experiment: Experiment, rounds: int) -> Stage:
 
     return _stage(
         "retrain",
-        retrain,
+        retrain.run,
         experiment,
         settings(rounds),
         ("scene", "object", trained_in),
@@ -207,4 +203,4 @@ def _live(experiment: Experiment) -> Stage:
         victim=victim_sha256(experiment, main) if is_given else main,
     )
     after = ("capture",) if is_given else ("capture", config.policy_stage(main))
-    return _stage("live", live, experiment, settings, after)
+    return _stage("live", live.run, experiment, settings, after)
