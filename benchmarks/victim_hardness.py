@@ -17,6 +17,7 @@ from advnerf_core.report.evidence.hardness import (
     FamilyHardness,
     HardnessError,
     HardnessVerdict,
+    read_hardness,
     write_hardness,
 )
 from nodes.experiment.show.context import Experiment
@@ -29,7 +30,7 @@ from nodes.experiment.steps.attack import (
     planned_evaluations,
     search_settings,
 )
-from nodes.experiment.steps.verdicts import VALIDATED_ON, hardness_record, trained_on
+from nodes.experiment.steps.verdicts import VALIDATED_ON, trained_on
 
 _SEED = 20_000  # no search uses it
 
@@ -53,7 +54,7 @@ def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVer
     Raises:
         HardnessError: A gradient search of this run folder has begun, or three other recipes were judged.
     """
-    record = hardness_record(experiment)
+    record = read_hardness(experiment.folder / FILE)
     policy = load_victim(experiment, victim)
     known = next((each for each in record.verdicts if each.policy_sha256 == policy.sha256), None)
     if known is not None:

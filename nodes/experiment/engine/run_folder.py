@@ -35,9 +35,7 @@ class RunFolder:
     """One resolved experiment.
 
     Attributes:
-        config: The resolved configuration.
-        file: The experiment file.
-        setting: Name of the setting, e.g. ``demo``.
+        setting: Name of the setting, e.g. ``demo``; empty for a file without settings.
     """
 
     config: ExperimentConfig

@@ -46,11 +46,8 @@ class Prepared:
     """An attack, ready for the search.
 
     Attributes:
-        experiment: The requested experiment.
         cell: The victim, path and method of the attack, and the seed of starts, search and disturbances.
         policy: The victim with its view and hash.
-        space: The search space.
-        problem: The attack problem for the searches.
     """
 
     experiment: Experiment

@@ -70,7 +70,11 @@ def is_mesh(kind: str) -> bool:
 
 def files_of(kinds: list[str]) -> dict[str, str]:
     """Hash of each kind that is a file, by its name in results."""
-    return {name_of(kind): _content(kind) for kind in kinds if kind not in MADE_HERE_M}
+    return {
+        name_of(kind): load_mesh_of(kind).sha256 if is_mesh(kind) else sha256_of(Path(kind))
+        for kind in kinds
+        if kind not in MADE_HERE_M
+    }
 
 
 def footprint_m(kind: str) -> tuple[float, float]:
@@ -107,7 +111,3 @@ def load_mesh_of(kind: str) -> SurfaceMesh:
     from advnerf_core.objects.voxel.mesh_files import load_mesh
 
     return load_mesh(Path(kind))
-
-
-def _content(kind: str) -> str:
-    return load_mesh_of(kind).sha256 if is_mesh(kind) else sha256_of(Path(kind))

@@ -128,7 +128,8 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
         against = [name for name in methods if name not in (GRADIENT, COARSE_GRADIENT)]
         if GRADIENT not in methods or not against:
             continue
-        lacking = _lacking(methods, config)
+        families = unseen(RANDOM_FAMILIES, config)
+        lacking = lacking_baselines(methods, _coarse_cells_differ(config), families)
         if lacking:
             raise RegistrationError(
                 f"{scenario}: expected the baselines that a test of the gradient needs, got {', '.join(against)} "
@@ -142,10 +143,6 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
             if names
         ]
     return tests
-
-
-def _lacking(methods: Sequence[str], config: ExperimentConfig) -> list[str]:
-    return lacking_baselines(methods, _coarse_cells_differ(config), unseen(RANDOM_FAMILIES, config))
 
 
 def _coarse_cells_differ(config: ExperimentConfig) -> bool:

@@ -54,7 +54,6 @@ class LiveRun:
     Attributes:
         name: Name of its folder and its result.
         scenario: Name of the path.
-        start: Start pose.
         attack: Shown attack; None for none.
         ticks: Number of measured control ticks; None uses the experiment's.
         empty: Whether the panel is removed.
@@ -122,11 +121,7 @@ def _command_age_limit_s(graph: Plan) -> float:
 
 
 class LiveNodes:
-    """The live nodes of an experiment, which are started for the first drive and kept for the next ones; see `TrialNodes`.
-
-    Args:
-        experiment: Experiment in the lab.
-    """
+    """The live nodes of an experiment, which are started for the first drive and kept for the next ones; see `TrialNodes`."""
 
     def __init__(self, experiment: Experiment) -> None:
         self._experiment = experiment

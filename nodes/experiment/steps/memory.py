@@ -49,13 +49,13 @@ def measure(experiment: Experiment, folder: Path, report: Report) -> dict[int, f
     return {int(ticks): mib for ticks, mib in rows.items()}
 
 
-def in_a_child(module: str, path: Path, horizons: Sequence[int], *more: str) -> Iterator[tuple[int, float]]:
+def in_a_child(module: str, path: Path, horizons: Sequence[int]) -> Iterator[tuple[int, float]]:
     """Horizons and their peaks [MiB] as a module's command measures them, in a process that returns freed memory.
 
     Raises:
         subprocess.CalledProcessError: The process failed.
     """
-    command = module_command(module, str(path), *more, *map(str, horizons))
+    command = module_command(module, str(path), *map(str, horizons))
     environment = {**os.environ, **RETURNS_WHAT_IS_FREED}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as child:
         assert child.stdout is not None

@@ -108,7 +108,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             # After every round: a loop takes hours, and may be interrupted.
             write_json(folder / "retrain.json", summary)
             retrain_plot.draw(folder / "curve.png", rounds, wanted.pays_ratio)
-            if number == wanted.rounds or not _pays(found, wanted.pays_ratio):
+            if number == wanted.rounds or not max(found.ratios["surrogate"].values()) >= wanted.pays_ratio:
                 break
             thetas += list(found.thetas.values())
             new = _collect(experiment, scene, victim, thetas, here, told)
@@ -141,10 +141,6 @@ def _stepping(told: Told, steps: int) -> Callable[[int, float], None]:
         told(0.7 + 0.3 * step / steps, f"fine-tuning: error {loss**0.5:.3f} rad/s")
 
     return stepped
-
-
-def _pays(found: Found, ratio: float) -> bool:
-    return max(found.ratios["surrogate"].values()) >= ratio
 
 
 def _old_frames(experiment: Experiment) -> list[Frames]:

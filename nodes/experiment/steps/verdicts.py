@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from advnerf_core.report.evidence.hardness import FILE, HardnessRecord, read_hardness
+from advnerf_core.report.evidence.hardness import FILE, read_hardness
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.show.context import Experiment
 
@@ -22,12 +22,7 @@ def unseen(methods: Iterable[str], config: ExperimentConfig) -> list[str]:
     return [name for name in dict.fromkeys(methods) if name not in seen]
 
 
-def hardness_record(experiment: Experiment) -> HardnessRecord:
-    """The verdicts in the run folder of an experiment."""
-    return read_hardness(experiment.folder / FILE)
-
-
 def passing_digest(experiment: Experiment, policy_sha256: str) -> str:
     """Digest of the passing verdict of a policy; empty without one: then no page calls the victim hardened."""
-    verdict = hardness_record(experiment).passing(policy_sha256)
+    verdict = read_hardness(experiment.folder / FILE).passing(policy_sha256)
     return "" if verdict is None else verdict.digest
