@@ -60,7 +60,7 @@ def _result(file: Path, changed_ns: int) -> Mapping[str, Any]:
         for domain in ("surrogate", "deployed")
         if data.get(domain)
     }
-    return {"seconds": float(data["seconds"]), "attack_id": data.get("attack_id"), "measured": measured}
+    return {"seconds": float(data["seconds"]), "measured": measured}
 
 
 def _mean(values: list[float]) -> float:

@@ -81,7 +81,7 @@ def texture_png(folder: Path) -> bytes | None:
         pictures = (
             _attack_pictures(folder / ATTACK)
             if (folder / ATTACK).exists()
-            else _state_pictures(folder / STATE)
+            else [_picture(read_tensors(folder / STATE, "numpy", ["best_theta"])[1]["best_theta"])]
         )
     except (OSError, ValueError, KeyError, AttackFileError):
         return None
@@ -94,10 +94,6 @@ def _attack_pictures(file: Path) -> list[Pixels]:
     if attack.face is not None:
         return [np.asarray(attack.face.texture, np.uint8)]
     return [_picture(each.theta) for each in attack.objects]
-
-
-def _state_pictures(file: Path) -> list[Pixels]:
-    return [_picture(read_tensors(file, "numpy", ["best_theta"])[1]["best_theta"])]
 
 
 def _picture(theta: NDArray[np.float32]) -> Pixels:

@@ -38,11 +38,7 @@ _REPORT_POLICY = (
 
 
 class RequestHandler:
-    """Answers the requests of browsers.
-
-    Args:
-        clock_s: Seconds since 1970.
-    """
+    """Answers the requests of browsers; the clock says seconds since 1970."""
 
     def __init__(self, folder: Path, clock_s: Callable[[], float] = time.time) -> None:
         self._folder, self._clock_s = folder, clock_s

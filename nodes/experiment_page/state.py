@@ -25,7 +25,8 @@ def read_state(folder: Path, now_s: float) -> dict[str, Any]:
     if not record:
         return {"name": folder.name, "phase": "waiting", "parts": [], "curves": [], "searches": []}
     know_methods_of(folder / _CELLS, {cell["method"] for cell in record["cells"]})
-    stages, cells = _stages(record), _cells(folder, record)
+    stages = [{**record["parts"][name], "kind": "stage", "title": name} for name in record["stages"]]
+    cells = _cells(folder, record)
     phase = _phase(record)
     left_s, known = all_left_s(stages, cells, now_s)
     films = shown_files.films(folder, cell_names(record))
@@ -52,10 +53,6 @@ def read_state(folder: Path, now_s: float) -> dict[str, Any]:
         "recorded": None if films else recorded_state(folder),
         "log": record["log"][-_LINES:],
     }
-
-
-def _stages(record: Mapping[str, Any]) -> list[dict[str, Any]]:
-    return [{**record["parts"][name], "kind": "stage", "title": name} for name in record["stages"]]
 
 
 def _cells(folder: Path, record: Mapping[str, Any]) -> list[dict[str, Any]]:

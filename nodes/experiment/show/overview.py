@@ -6,10 +6,9 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, invert_transform, transform_points
-from hardware.worlds.world import Overview, World
+from hardware.worlds.world import Overview, Rgb, World
 from nodes.experiment.show.context import Experiment
 
 _PATHS_RGB = ((40, 110, 230), (235, 140, 20), (200, 40, 170), (20, 150, 110), (120, 80, 200), (150, 110, 40))
@@ -17,11 +16,10 @@ _OBJECT_RGB, _EDGE_RGB, _PAPER = (240, 30, 30), (150, 150, 150), 255
 _WIDTH, _HEIGHT, _MARGIN_M = 960, 720, 3.0
 _ABOVE_GROUND_M, _SPACING_M = 0.05, 0.25
 
-Image = NDArray[np.uint8]
 Project = Callable[[Array], Array]
 
 
-def from_above(experiment: Experiment, world: World) -> Image:
+def from_above(experiment: Experiment, world: World) -> Rgb:
     """Picture ``[H, W, 3]`` of an open world: its own view from above if it has one, else a plan on white paper."""
     picture, project = _photographed(world) if isinstance(world, Overview) else _plan(experiment)
     driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.car.speed_mps
@@ -35,13 +33,13 @@ def from_above(experiment: Experiment, world: World) -> Image:
     return picture
 
 
-def _photographed(world: Overview) -> tuple[Image, Project]:
+def _photographed(world: Overview) -> tuple[Rgb, Project]:
     """The world's own view from above, and the projection of points ``[..., 3]`` into it [px]."""
     picture, pinhole, T = world.overview()
     return picture.copy(), lambda points: pinhole.project(transform_points(invert_transform(T), points))
 
 
-def _plan(experiment: Experiment) -> tuple[Image, Project]:
+def _plan(experiment: Experiment) -> tuple[Rgb, Project]:
     """White paper with the edges of the roads, and the projection of points ``[..., 3]`` onto it [px]."""
     edges = experiment.world.road_edge
     seen = [
@@ -64,6 +62,6 @@ def _plan(experiment: Experiment) -> tuple[Image, Project]:
     return picture, project
 
 
-def _draw(picture: Image, pixels: Array, rgb: tuple[int, int, int], closed: bool) -> None:
+def _draw(picture: Rgb, pixels: Array, rgb: tuple[int, int, int], closed: bool) -> None:
     line = np.rint(pixels * 16.0).astype(np.int32)[:, None]
     cv2.polylines(picture, [line], closed, rgb, thickness=2, lineType=cv2.LINE_AA, shift=4)

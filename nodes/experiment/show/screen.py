@@ -6,15 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, invert_transform, transform_points
 from calibration.display_colour import DisplayFit, colours_to_show, fit_display, mean_colour, screen_region
 from calibration.panel import MonitorPanel
-from hardware.worlds.world import Panel, Screens, World
+from hardware.worlds.world import Panel, Rgb, Screens, World
 from nodes.runtime.errors import ConfigError
 
-Rgb = NDArray[np.uint8]
 # Poses of the car for measuring the colours: distance [m], and angles to the panel's normal [rad] for the falloff.
 _DISTANCE_M, _ANGLES_RAD = 1.1, (0.0, 0.5, -0.85)
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackFile, face_texture
@@ -28,6 +27,7 @@ from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
 from advnerf_core.scene.fidelity import PicturePairs
 from advnerf_core.scene.surrogate import Surrogate
+from hardware.worlds.world import Rgb
 from nodes.bags.decoded import read_decoded, read_poses
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.experiment.plan.cell import Cell
@@ -46,7 +46,6 @@ from nodes.runtime.errors import BagError, RuntimeFault
 from nodes.runtime.messages import stamp_ns
 from nodes.runtime.pictures import rgb_image
 
-Rgb = NDArray[np.uint8]
 _MOST_FRAMES = 120
 _CAR, _IMAGE, _SAFETY = "/vicon/car", "/compositor/image", "/safety/state"
 
