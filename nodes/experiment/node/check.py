@@ -120,7 +120,7 @@ def check(request: Experiment, directions: int, memory: bool, report: Report) ->
     adjoint = slopes_of(reference.gradient, along)
     return Check(
         relative_error(adjoint, frozen),
-        _difference(result.gradient.double(), reference.gradient),
+        relative_error(result.gradient.double().flatten().numpy(), reference.gradient.flatten().numpy()),
         float(reference.gradient.norm()),
         tuple(adjoint),
         tuple(frozen),
@@ -150,10 +150,6 @@ def _frozen_slopes(problem: AttackProblem, theta: Tensor, along: Tensor) -> tupl
     reference = adjoint_gradient(problem, theta)
     loss = partial(frozen_loss, problem, rollout=reference.rollout)
     return reference, central_slopes(loss, theta, along, _STEP)
-
-
-def _difference(got: Tensor, expected: Tensor) -> float:
-    return relative_error(got.flatten().numpy(), expected.flatten().numpy())
 
 
 def _memory(request: Experiment, report: Report) -> dict[int, float]:

@@ -107,8 +107,7 @@ def _leaves(values: Mapping[str, Any], above: tuple[str, ...]) -> Iterator[tuple
 def variants_in(over: Any) -> dict[str, list[AxisChange]]:
     """The variants of a section ``over`` by name, each with its changes: the product of its named variants and its axes.
 
-    Args:
-        over: The section before validation; its errors are reported there.
+    The section is not validated yet; its errors are reported there.
 
     Raises:
         ValueError: Two variants have one name, or there are too many.

@@ -18,7 +18,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, over_the_world
 from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import cell_data
-from nodes.experiment.steps.films import film_cell, kept_film, with_film
+from nodes.experiment.steps.films import film_cell, kept_film
 from nodes.experiment.steps.frozen import check_frozen, freeze
 from nodes.experiment.steps.keys import clean_folder, require_known, stages_needed
 from nodes.experiment.steps.live import LiveNodes
@@ -32,8 +32,7 @@ _SEARCHED = 0.9  # share of a cell's work
 class Bench:
     """Common resources of an experiment's cells while several are run one after the other: the open world, the space, the live nodes.
 
-    Args:
-        experiment: Experiment with finished scene, objects and policies (``advnerf experiment run FILE --until policy``).
+    Its scene, objects and policies are finished (``advnerf experiment run FILE --until policy``).
     """
 
     def __init__(self, experiment: Experiment) -> None:
@@ -97,7 +96,8 @@ def run_cell(
         if shared.deployed_in is None or "not_driven_live" in data:
             return data
         film = kept_film(folder) or film_cell(experiment, shared.scene, shared.space, cell, folder, driven)
-        return with_film(data, film)
+        # Relative to the folder of all cells.
+        return {**data, "extra": {**data["extra"], "clip": f"{film.parent.name}/{film.name}"}}
 
 
 def search_cell(

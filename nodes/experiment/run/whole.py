@@ -68,8 +68,11 @@ def run_experiment(
     ended: list[Ended] = []
     if until in (None, REPORT):
         options = options or Options(here=True, ready=True)
-        require_same_steering(experiment, not options.gate, partial(_say, console, record))
-        ended = _run_cells(experiment, chosen, options, console, record)
+        say = partial(_say, console, record)
+        require_same_steering(experiment, not options.gate, say)
+        if record is not None:
+            _record_cells_there(experiment, chosen, options, record)
+        ended = run_cells(experiment, chosen, options, say, console, record)
         _write_report(experiment, console, record)
     console.print(
         f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s",
@@ -77,18 +80,6 @@ def run_experiment(
         markup=False,
     )
     return ended
-
-
-def _run_cells(
-    experiment: Experiment,
-    chosen: Sequence[Cell],
-    options: Options,
-    console: Console,
-    record: ProgressRecord | None,
-) -> list[Ended]:
-    if record is not None:
-        _record_cells_there(experiment, chosen, options, record)
-    return run_cells(experiment, chosen, options, partial(_say, console, record), console, record)
 
 
 def _say(console: Console, record: ProgressRecord | None, text: str) -> None:

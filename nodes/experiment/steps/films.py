@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,6 @@ from nodes.experiment.steps.keys import driven_folder
 from nodes.experiment.steps.search_files import SEARCHED
 from nodes.lab.trials import evaluation
 
-DOMAINS = ("surrogate", "deployed")
 _FRAME_S = 0.1  # of films: finer ticks are not all filmed
 
 
@@ -99,13 +97,6 @@ def _deployed_track(
 def kept_film(folder: Path) -> Path | None:
     """The film of a cell in its folder; None without one."""
     return next(folder.glob("clip.*"), None)
-
-
-def with_film(data: dict[str, Any], film: Path | None) -> dict[str, Any]:
-    """The cell with the name of its film, relative to the folder of all cells."""
-    if film is None:
-        return data
-    return {**data, "extra": {**data["extra"], "clip": f"{film.parent.name}/{film.name}"}}
 
 
 def filmed(dt_s: float) -> tuple[int, float]:
