@@ -32,7 +32,6 @@ class Part:
     """One stage or cell of an experiment.
 
     Attributes:
-        name: Name of the stage or of the cell.
         text: The current step, or why it failed.
         fraction: Finished share, 0..1.
         first_fraction: Share that was finished at the start, if it was resumed.

@@ -51,12 +51,10 @@ class Check:
     Attributes:
         frozen_error: Relative error of the gradient against finite differences with frozen poses, float64.
         float32_error: Relative difference of the gradient as the attack computes it to the one in float64.
-        clean: The drive without an attack.
         closed: The cosine to the true closed loop, over steps of the finite differences; information only.
         adjoint: Derivatives along the directions, by the adjoint.
         frozen: Derivatives along the directions, by finite differences with frozen poses.
         ticks: Adjoints, saturation and visibility over time.
-        split: Time by part.
         memory_mib: Peak above idle by horizon, with an empty cache; empty if it was not measured.
     """
 

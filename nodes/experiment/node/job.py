@@ -34,9 +34,7 @@ class Said:
     """One output of a search.
 
     Attributes:
-        job: The search.
         kind: ``progress``, ``image``, ``done``, ``failed`` or ``ended``.
-        data: Values of the output.
         pixels: Pixels of an image, ``height * width * 3`` bytes RGB.
     """
 

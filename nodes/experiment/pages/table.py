@@ -46,7 +46,6 @@ def write_table(
     """Write JSON, CSV, Markdown and the page with the clips beside it; returns the page.
 
     Args:
-        sections: Further parts of the page.
         first: Contents of the first screen; None for the sentences of the table alone.
         notes: Paragraphs before the sentence, such as missing methods.
     """

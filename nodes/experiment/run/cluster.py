@@ -73,7 +73,6 @@ def run_on_ray(
 
     Args:
         work: Function of one job, which runs in a worker and returns something else than None.
-        jobs: The jobs, as plain data.
 
     Yields:
         Each finished job, with the result; None if its machine was lost.

@@ -95,7 +95,6 @@ class PublishedBuild:
     """The reference build after its publication.
 
     Attributes:
-        folder: Folder of the reference build.
         written: New folders of stages there.
         removed: Folders of stages that no published cell was run with.
         size_bytes: Size of all its files.

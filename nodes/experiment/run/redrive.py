@@ -49,7 +49,6 @@ class Redriven:
     """A cell that was driven again.
 
     Attributes:
-        name: Name of the cell.
         off_m: Largest distance of a pose from the published one [m].
         same: Whether that is within `TOLERANCE_M`.
     """

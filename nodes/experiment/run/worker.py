@@ -54,8 +54,6 @@ class Job:
 
     Attributes:
         folder: The run folder for results; the same folder on every machine.
-        file: Experiment file.
-        overrides: Changes of the setting.
         settings_hash: Hash of everything that the result depends on, at planning time.
         phase: ``search``: only the part that may run beside others; ``whole``: all of it.
         registration: Digest of the registration that it is run under; empty without one.
@@ -90,9 +88,7 @@ class Ended:
     """How the process of a cell ended.
 
     Attributes:
-        name: Name of the cell.
         how: ``done``, ``failed`` (the error is stored), ``elsewhere`` (another process runs it), or ``lost`` (killed: the next run resumes it).
-        text: Message about the end.
         seconds: Wall time [s].
     """
 

@@ -214,7 +214,6 @@ class DeployedDrive:
     Attributes:
         states: True states ``[T + 1, 3]``.
         controls: Commands of the policy ``[T]``.
-        metrics: Total CTE and related metrics.
         blocked_tick: Tick of a collision; None without one.
         collided_with: Name of the obstacle; None without a collision.
     """

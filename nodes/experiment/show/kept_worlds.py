@@ -28,7 +28,6 @@ class KeptWorld(PlainData):
     """Stored facts about a world.
 
     Attributes:
-        section: The section of the experiment file that names it.
         source_sha256: Hash of its code.
         settings: Output of `NamedWorld.settings`.
         traits: Output of `NamedWorld.traits`.

@@ -59,7 +59,6 @@ def measure_display(
 
     Args:
         world: The open world; its screen shows the last colour afterwards.
-        seed: Seed of the mixed colours.
         frames_of: Converts a rendered picture to camera frames, such as several noisy ones; None uses the picture itself.
     """
     colours, screens = colours_to_show(seed=seed), screens_of(world)

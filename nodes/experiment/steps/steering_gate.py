@@ -68,7 +68,6 @@ class SteeringDifference:
     Attributes:
         mean: Mean of the absolute differences, in the unit of the car's control.
         allowed: The largest mean at which both count as equal.
-        correlation: Correlation of both.
     """
 
     mean: float
