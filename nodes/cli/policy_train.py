@@ -167,6 +167,9 @@ def train(
         rows.add_row(name, labels_of.get(name, "expert"), str(count), left_out)
     print_table(rows)
     print("".join(f"{note}\n" for note in crop_notes(opened, view)), end="")
+    for each in opened:
+        if each.log.joined_by:
+            print(f"{each.name}: images and steering are joined by {each.log.joined_by}")
     print(
         f"{done.path} {done.sha256[:12]}, {1e3 * done.validation_mae_rad:.1f} mrad from the labels on held-out frames"
         + "".join(f"; {name} unchecked: {reason}" for name, reason in done.unchecked.items())

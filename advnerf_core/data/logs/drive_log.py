@@ -16,7 +16,8 @@ from advnerf_core.data.logs.choice import LogChoice, LogError, Side
 
 Labels = Literal["expert", "recorded"]
 NOWHERE = (math.nan, math.nan, math.nan)
-_STEEPEST_RAD = 1.0
+# Of front wheels: at this angle and above, a value is in degrees, or in another unit.
+STEEPEST_RAD = 1.0
 
 
 @dataclass(frozen=True)
@@ -68,9 +69,9 @@ class SteeringUnit:
                 "(the wheel angle at a value of 1, and the side of positive values)"
             )
         angle_rad = value * self.full_rad * (1.0 if self.positive == "left" else -1.0) + self.offset_rad
-        if abs(angle_rad) >= _STEEPEST_RAD:
+        if abs(angle_rad) >= STEEPEST_RAD:
             raise LogError(
-                f"{place}: expected a steering angle below {_STEEPEST_RAD:g} rad, got {value:g} times {self.full_rad:g}; "
+                f"{place}: expected a steering angle below {STEEPEST_RAD:g} rad, got {value:g} times {self.full_rad:g}; "
                 "give the wheel angle at a value of 1 with --steering-full-rad"
             )
         return angle_rad
@@ -122,6 +123,7 @@ class DriveLog:
         left_out: Number of records that the log itself marks as unusable, by reason.
         attached: Reads attached files by name, such as ``camera.yaml``.
         unchecked: Why damage may go unnoticed; empty if checksums cover the log.
+        joined_by: What images and steering were joined by, if not by capture stamps, and why.
     """
 
     path: Path
@@ -140,6 +142,7 @@ class DriveLog:
     left_out: Mapping[str, int] = field(default_factory=dict)
     attached: Callable[[], Mapping[str, bytes]] = dict
     unchecked: str = ""
+    joined_by: str = ""
 
     def first_image(self) -> Rgb:
         """The first image.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import islice
@@ -27,8 +27,8 @@ from advnerf_core.data.logs.drive_log import (
     median_rate_hz,
 )
 from advnerf_core.geometry import yaw_of
-from nodes.bags.images import CAMERA_TOPICS, image_messages
-from nodes.bags.info import BagInfo
+from nodes.bags.images import CAMERA_TOPICS
+from nodes.bags.info import BagInfo, BagMessage
 from nodes.bags.reader import read_attachments, read_info, read_messages
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
@@ -43,6 +43,8 @@ _IMAGES = ("/compositor/image", *CAMERA_TOPICS)
 _ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 _JOIN_S = 0.12
 _TIMED = 200  # images from which the rate is determined
+_STAMPS = 8  # messages that show whether a topic is stamped
+_Time = Callable[[BagMessage, Any], int]
 
 
 @dataclass
@@ -97,7 +99,10 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
     controls = tuple(sorted(controls, key=lambda name: (name != _SENT, name)))
     steering = _steering_topic(choice.steering, controls, bag)
     joined = [name for name in (CAR_TOPIC, _SAFETY, _EXPERT) if name in counts]
-    track = cache(partial(_read_track, bag, steering, joined))
+    kinds = {images: IMAGE_TYPE, **({steering: _steering_type(steering)} if steering else {})}
+    unstamped = _unstamped(bag, kinds)
+    time_ns = _recorded_ns if unstamped else _stamped_ns
+    track = cache(partial(_read_track, bag, steering, joined, time_ns))
     return DriveLog(
         bag,
         _format(info),
@@ -110,10 +115,13 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
         _rate_hz(bag, images),
         counts.get(CAR_TOPIC, 0),
         lambda: np.array([each[1] for each in track().sent], np.float64),
-        lambda: _frames(bag, images, track()),
-        labels="expert",
+        lambda: _frames(bag, images, track(), time_ns),
+        labels="expert" if counts.get(CAR_TOPIC) else "recorded",
         attached=lambda: read_attachments(bag) if info.attachments else {},
         unchecked=info.unchecked,
+        joined_by=f"times of recording, as all stamps on {' and '.join(unstamped)} are equal"
+        if unstamped
+        else "",
     )
 
 
@@ -132,9 +140,39 @@ def _steering_topic(wanted: str | None, controls: tuple[str, ...], bag: Path) ->
     return None
 
 
-def _frames(bag: Path, images: str, track: _Track) -> Iterator[LogFrame]:
-    for number, image in enumerate(image_messages(bag, images)):
-        stamp_ns = ns_from_stamp(image.header.stamp)
+def _steering_type(topic: str) -> str:
+    return topic_row(topic).type if topic == _SENT else _ACKERMANN
+
+
+def _unstamped(bag: Path, kinds: Mapping[str, str]) -> list[str]:
+    """Topics whose first messages all have one stamp, as of a node that leaves it at zero: such a stamp joins nothing.
+
+    Args:
+        kinds: Types by topic.
+    """
+    found = []
+    for topic, kind in kinds.items():
+        messages = islice(read_messages(bag, [topic], types={topic: kind}), _STAMPS)
+        stamps = [_stamped_ns(message, decode(kind, message.cdr)) for message in messages]
+        if len(stamps) > 1 and len(set(stamps)) == 1:
+            found.append(topic)
+    return found
+
+
+def _stamped_ns(message: BagMessage, decoded: Any) -> int:
+    del message
+    return ns_from_stamp(decoded.header.stamp)
+
+
+def _recorded_ns(message: BagMessage, decoded: Any) -> int:
+    del decoded
+    return message.log_ns
+
+
+def _frames(bag: Path, images: str, track: _Track, time_ns: _Time) -> Iterator[LogFrame]:
+    for number, message in enumerate(read_messages(bag, [images], types={images: IMAGE_TYPE})):
+        image = decode(IMAGE_TYPE, message.cdr)
+        stamp_ns = time_ns(message, image)
         steering_rad, speed_mps = track.command(stamp_ns)
         yield LogFrame(
             rgb_image(image, f"{images} in {bag}"),
@@ -148,20 +186,20 @@ def _frames(bag: Path, images: str, track: _Track) -> Iterator[LogFrame]:
         )
 
 
-def _read_track(bag: Path, steering: str | None, topics: list[str]) -> _Track:
+def _read_track(bag: Path, steering: str | None, topics: list[str], time_ns: _Time) -> _Track:
     track = _Track()
     wanted = [*topics, *([steering] if steering else [])]
     types = {steering: _ACKERMANN} if steering and steering != _SENT else {}
     for message in read_messages(bag, wanted, types=types) if wanted else ():
         kind = types.get(message.topic) or topic_row(message.topic).type
-        _add(track, message.topic, kind, decode(kind, message.cdr))
+        decoded = decode(kind, message.cdr)
+        _add(track, message.topic, kind, decoded, time_ns(message, decoded))
     for stream in (track.armed, track.sent, track.disturbed):
         stream.sort()
     return track
 
 
-def _add(track: _Track, topic: str, kind: str, message: Any) -> None:
-    stamp_ns = ns_from_stamp(message.header.stamp)
+def _add(track: _Track, topic: str, kind: str, message: Any, stamp_ns: int) -> None:
     if topic == CAR_TOPIC:
         track.poses.add(stamp_ns, pose_matrix(message))
     elif topic == _SAFETY:

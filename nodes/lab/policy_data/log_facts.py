@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.data.logs.drive_log import DriveLog
+from advnerf_core.data.image_files import Rgb
+from advnerf_core.data.logs.drive_log import STEEPEST_RAD, DriveLog
 from nodes.lab.policy_data.frames import HOLDOUT_EVERY, LEAST_FRAMES
 
-_LOOKED_AT = 32
+_LOOKED_AT, _LOOKING_S = 32, 3.0
 _FEW_IMAGES = 1000
 _LEAST_SCENE_IMAGES = 20
 _STEADY = 1e-3  # standard deviation, as a share of a steering of 1
@@ -34,6 +36,8 @@ class LogFacts:
         size: Width and height of the images [px].
         steering: Finite steering values in the log's unit.
         same_image: Whether the first images are all the same.
+        looked_at: Images that were looked at.
+        joined: Whether a steering value belongs to one of them.
         has_camera: Whether the calibration of the camera is attached.
     """
 
@@ -42,6 +46,8 @@ class LogFacts:
     steering: NDArray[np.float64]
     missing: int
     same_image: bool
+    looked_at: int
+    joined: bool
     has_camera: bool
 
     def verdicts(self) -> list[Verdict]:
@@ -57,7 +63,16 @@ class LogFacts:
             return f"{log.unit.name} has no value"
         if float(self.steering.std()) < _STEADY:
             return f"the steering is always {self.steering[0]:.3g}"
-        return f"give {log.unit.unknown}" if log.unit.unknown else ""
+        if log.unit.unknown:
+            return f"give {log.unit.unknown}"
+        steepest_rad = float(np.abs(self.steering).max()) * (log.unit.full_rad or 0.0)
+        if steepest_rad >= STEEPEST_RAD:
+            return f"{steepest_rad:.3g} rad is no angle of front wheels; give the angle at a value of 1 with --steering-full-rad"
+        return (
+            ""
+            if self.joined
+            else f"no steering belongs to any of the first {self.looked_at} images: their times differ"
+        )
 
     def _unusable_images(self) -> str:
         if self.log.count < LEAST_FRAMES:
@@ -71,10 +86,7 @@ class LogFacts:
         if why:
             return Verdict("learn a policy", False, why)
         few = f"; {log.count} images are few, expect a weak policy" if log.count < _FEW_IMAGES else ""
-        recorded = "labels are the recorded steering"
-        if not by_expert and log.labels == "expert":
-            recorded += " (--labels recorded): no poses for the expert"
-        return Verdict("learn a policy", True, (by_expert or recorded) + few)
+        return Verdict("learn a policy", True, (by_expert or "labels are the recorded steering") + few)
 
     def _scene(self) -> Verdict:
         log = self.log
@@ -107,11 +119,26 @@ def read_facts(log: DriveLog) -> LogFacts:
     Raises:
         AdvnerfError: One of the first images is missing or damaged.
     """
-    images = [frame.image for frame in islice(log.frames(), _LOOKED_AT)]
+    images, looked_at, joined = list[Rgb](), 0, False
+    ends_s = time.monotonic() + _LOOKING_S
+    for frame in log.frames():
+        looked_at += 1
+        joined |= math.isfinite(frame.steering)
+        if len(images) < _LOOKED_AT:
+            images.append(frame.image)
+        elif joined or time.monotonic() > ends_s:
+            break
     values = log.steering()
     known = values[np.isfinite(values)]
     height, width = images[0].shape[:2] if images else (0, 0)
     same = len(images) > 1 and all(np.array_equal(images[0], other) for other in images[1:])
     return LogFacts(
-        log, (width, height), known, len(values) - len(known), same, "camera.yaml" in log.attached()
+        log,
+        (width, height),
+        known,
+        len(values) - len(known),
+        same,
+        looked_at,
+        joined,
+        "camera.yaml" in log.attached(),
     )

@@ -13,6 +13,7 @@ from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.view import PolicyView
 from nodes.bags.writer import BagWriter
 from nodes.lab.policy_data.frames import frames_of
+from nodes.lab.policy_data.log_facts import read_facts
 from nodes.lab.policy_data.logs import open_log
 from nodes.runtime.messages import encode, header, image_message, pose_message, types
 from tests.support.commands import advnerf
@@ -103,8 +104,14 @@ def test_an_export_has_an_episode_for_each_drive_and_never_replaces_one(tmp_path
     assert sorted(each.name for each in tmp_path.iterdir()) == ["bag", "set", "two"]
 
 
-def write_ackermann(path, form, topics=("/drive",)):
-    """A bag of other software: images, and commands of a car."""
+def write_ackermann(path, form, topics=("/drive",), unstamped=(), late_ns=1000, step=0.02, count=6):
+    """A bag of other software: images, and commands of a car.
+
+    Args:
+        unstamped: Topics whose stamps are all zero.
+        late_ns: From an image to the recording of its command, and, in another clock, to its stamp [ns].
+        step: Steering of an image above that of the one before.
+    """
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
@@ -121,14 +128,19 @@ def write_ackermann(path, form, topics=("/drive",)):
     with writer:
         images = writer.add_connection("/front/image", IMAGE, typestore=store)
         drives = [writer.add_connection(topic, ACKERMANN, typestore=store) for topic in topics]
-        for k in range(6):
+        for k in range(count):
             image = make.image(k)
             t = image.header.stamp.sec * 10**9 + image.header.stamp.nanosec
+            if "/front/image" in unstamped:
+                image.header.stamp.sec = image.header.stamp.nanosec = 0
             writer.write(images, t, pack(image, IMAGE))
-            for drive in drives:
-                command = store.types[DRIVE](0.02 * k, 0.0, 1.5, 0.0, 0.0)
+            for topic, drive in zip(topics, drives, strict=True):
+                command = store.types[DRIVE](step * k, 0.0, 1.5, 0.0, 0.0)
                 message = store.types[ACKERMANN](header=make.header(k, "car"), drive=command)
-                writer.write(drive, t + 1000, pack(message, ACKERMANN))
+                message.header.stamp.sec += late_ns // 10**9
+                if topic in unstamped:
+                    message.header.stamp.sec = message.header.stamp.nanosec = 0
+                writer.write(drive, t + late_ns, pack(message, ACKERMANN))
     return path
 
 
@@ -144,6 +156,34 @@ def test_ackermann_commands_of_other_software_are_wheel_angles(tmp_path, form):
     assert [frame.steering for frame in log.frames()] == pytest.approx([0.02 * k for k in range(6)])
     assert [frame.speed_mps for frame in log.frames()] == pytest.approx([1.5] * 6)
     assert log.steering() == pytest.approx([0.02 * k for k in range(6)])
+
+
+@pytest.mark.parametrize("unstamped", [("/drive",), ("/front/image",), ("/front/image", "/drive")])
+def test_what_has_no_stamps_is_joined_by_the_times_of_recording(tmp_path, unstamped):
+    """A zero stamp of every command would give all images one command, the smallest."""
+    log = open_log(write_ackermann(tmp_path / "drive", "ros2", unstamped=unstamped))
+    assert log.joined_by == f"times of recording, as all stamps on {' and '.join(unstamped)} are equal"
+    assert [frame.steering for frame in log.frames()] == pytest.approx([0.02 * k for k in range(6)])
+    assert log.labels == "recorded"  # without poses there is no expert
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"late_ns": 60 * 10**9}, "no steering belongs to any of the first 20 images: their times differ"),
+        (
+            {"step": 1.0},
+            "19 rad is no angle of front wheels; give the angle at a value of 1 with --steering-full-rad",
+        ),
+    ],
+)
+def test_a_log_that_training_refuses_is_not_promised(tmp_path, change, told):
+    facts = read_facts(open_log(write_ackermann(tmp_path / "drive", "ros2", count=20, **change)))
+    learned, _, evaluated = facts.verdicts()
+    assert not learned.possible
+    assert (learned.why, evaluated.why) == (told, told)
+    facts = read_facts(open_log(write_ackermann(tmp_path / "right", "ros2", count=20)))
+    assert [each.possible for each in facts.verdicts()][::2] == [True, True]
 
 
 def test_of_two_topics_with_commands_none_is_taken_unasked(tmp_path):
