@@ -49,10 +49,8 @@ def drive_starts(
     found, horizon = [], Horizon(ticks, off_track_m=room.off_track_m)
     with Lab() as world:
         dressed = DressedScene(world, policy.contract.view, [face])
-        shown = (
-            dressed.plain_theta(),
-            torch.from_numpy(np.asarray(carrier.theta)).reshape(dressed.theta_shape),
-        )
+        plain = dressed.plain_theta()
+        shown = plain, torch.from_numpy(np.asarray(carrier.theta)).reshape(plain.shape)
         car = SelfDriving(world, SPEED_MPS, horizon.dt_s)
         for start in starts:
             none_m, attacked_m = (

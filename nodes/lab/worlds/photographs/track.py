@@ -22,16 +22,16 @@ _LEAST_SHARE = 0.25
 _SPACING, _MISS = 0.5, 0.04
 
 
-def driving_order(cars: Array, names: Sequence[str]) -> Array:
+def driving_order(cars: Array, names: Sequence[str]) -> Sequence[int]:
     """Indices of the photographs in the order of the drive: as they are listed, or by the numbers in their names if that continues longer.
 
     Args:
         cars: ``T_world_from_car [N, 4, 4]`` as listed.
         names: Names of their files.
     """
-    listed = np.arange(len(cars))
-    named = np.array(sorted(listed, key=lambda index: natural_order(names[index])), np.int64)
-    return max((listed, named), key=lambda order: len(_longest_part(cars[order])))
+    listed = list(range(len(cars)))
+    named = sorted(listed, key=lambda index: natural_order(names[index]))
+    return max(listed, named, key=lambda order: len(_longest_part(cars[order])))
 
 
 def driven_track(cars: Array) -> Array:
