@@ -116,7 +116,7 @@ def test_the_intersections_own_loop_drives_in_carla(library, settings):
             limits,
             SelfDriving(scene, 6.0, limits.dt_s),
         )
-        drive = drive_deployed(*arguments, torch.full(dressed.theta_shape, 9.0))
+        drive = drive_deployed(*arguments, torch.full_like(dressed.plain_theta(), 9.0))
     assert drive.states.shape == (5, 3)
     assert np.hypot(*np.diff(drive.states[:, :2], axis=0).T) == pytest.approx(0.6, abs=0.01)
     assert drive.metrics.total_cte_m == pytest.approx(
