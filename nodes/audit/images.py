@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -97,8 +96,8 @@ def _require_same_input(folder: Path, given: Path, metric: MetricOptions, has_me
         ConfigError: It is another place, or another metre.
     """
     file = folder / INPUT
-    now = {"given": str(given.resolve()), "content": _digest(given), "metric": asdict(metric)}
-    now = json.loads(json.dumps(now, default=str))
+    said = {name: str(value) for name, value in asdict(metric).items()}
+    now = {"given": str(given.resolve()), "content": _digest(given), "metric": said}
     before = read_json(file) if file.is_file() else now
     changed = [key for key in now if before.get(key) != now[key]]
     if "given" in changed and "content" not in changed:  # the same files elsewhere
