@@ -1,6 +1,6 @@
 """The markers around a print in a photograph: corners from straight lines through the edges, and how sharp these edges are.
 
-Blur rounds a corner inwards, but leaves a straight edge where it is. So each side's edge is located in profiles across it, in linear
+Blur rounds a corner inwards, but does not move a straight edge. So each side's edge is located in profiles across it, in linear
 light, a line is fitted in undistorted coordinates, and corners are where lines meet.
 """
 
@@ -107,7 +107,7 @@ def why_none(rgb: Rgb) -> str:
 
 
 def _located(light: NDArray[np.float32], lens: Intrinsics, rough: Array) -> Array | str:
-    """Corners ``[4, 2]`` of a marker, or why they cannot be told."""
+    """Corners ``[4, 2]`` of a marker, or why they cannot be found."""
     cell_px = float(np.linalg.norm(rough - np.roll(rough, -1, axis=0), axis=1).min()) / CELLS
     if cell_px < _LEAST_CELL_PX:
         return (

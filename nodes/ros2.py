@@ -46,7 +46,7 @@ class Ros2Config(StrictModel):
 
     Attributes:
         transport: ``dds``, ``zenoh``, or ``auto``: DDS where it is installed, else Zenoh. The ROS programs must use the same.
-        zenoh: How to find the ROS programs over Zenoh.
+        zenoh: Addresses and domain of the ROS programs over Zenoh.
         domain_id: ``ROS_DOMAIN_ID`` of the ROS programs.
         interface: Network interface. On any but the loopback, every computer of that network can read what is sent, and answer.
         open_to_network: Must be true for an interface other than the loopback, because ROS 2 has no keys here.

@@ -38,9 +38,9 @@ def posed(given: Path, folder: Path, metric: MetricOptions, in_metres: bool = Fa
     """The posed photographs of a place; input without poses, or without metres, is imported into the audit's folder, once.
 
     Args:
-        given: What the user named.
+        given: Folder or file of the place.
         folder: Folder of the audit.
-        metric: What gives the metre.
+        metric: The options that give the metre.
         in_metres: Whether the poses of posed photographs are in metres already.
 
     Raises:
@@ -84,7 +84,7 @@ def _known(poses: Path, kind: PlaceKind, scale: Scale | None) -> PosedPlace:
 
 
 def _scale_of(poses: Path) -> Scale | None:
-    """What gave the metre of an import; None if nothing did, or of poses from elsewhere, whose unit no file says."""
+    """What gave the metre of an import; None if nothing did, or for poses of other software, whose unit no file states."""
     scale: Scale | None = facts.get("scale_from", "poses") if (facts := _facts(poses.parent)) else None
     return scale
 
@@ -100,7 +100,7 @@ def _require_same_input(folder: Path, given: Path, metric: MetricOptions, has_me
     now = {"given": str(given.resolve()), "content": _digest(given), "metric": said}
     before = read_json(file) if file.is_file() else now
     changed = [key for key in now if before.get(key) != now[key]]
-    if "given" in changed and "content" not in changed:  # the same files elsewhere
+    if "given" in changed and "content" not in changed:  # the files were moved
         changed.remove("given")
     if changed and (changed != ["metric"] or has_metre):
         what = (

@@ -29,7 +29,10 @@ def test_a_recorded_drive_has_frames_and_poses_at_their_stamps(tmp_path):
     taken = take_frames(bag, tmp_path / "images", BagConfig(step_m=0.0), lambda share, text="": None)
     config = LabConfig()
     for file, T in zip(taken.files, taken.T_world_from_camera, strict=True):
-        true = planar_pose(*car_state(config, (int(file.stem) - START_NS) / 1e9)) @ config.camera.T_car_from_camera
+        true = (
+            planar_pose(*car_state(config, (int(file.stem) - START_NS) / 1e9))
+            @ config.camera.T_car_from_camera
+        )
         assert np.abs(T - true).max() < 0.004, "within the noise of the motion capture"
     assert (read_stored(taken.files[3])[0] == rgb).all(), (
         "frames are stored without loss, each at its own stamp"
