@@ -98,7 +98,7 @@ def command(policy: str, *options: str, output: str = "") -> list[str]:
         "--limit",
         str(LIMIT_M),
     ]
-    words += ["--evaluations", "60", "--starts", "8", "--object-size", "0.5"]
+    words += ["--evaluations", "60", "--starts", "8", "--object-size", "0.5", "--in-metres"]
     changes = [word for each in CHANGES for word in ("--set", each)]
     return [
         sys.executable,
