@@ -26,7 +26,7 @@ from tests.support.stage_versions import tiny_experiment
 
 ROOT = Path(__file__).parents[3]
 KEPT = ROOT / PUBLISHED / BUILD
-MOST_BYTES = 40e6
+MOST_BYTES = 60e6  # the junction's scene, objects and victims are 20 MB of it
 
 
 def test_it_is_whole_without_second_copies_and_small_enough(tmp_path):
@@ -40,7 +40,14 @@ def test_it_is_whole_without_second_copies_and_small_enough(tmp_path):
         assert taken is not None, f"{stage} is not as it was kept"
         for path in read_artefact(stage).files_in:
             assert not (stage / path).exists(), "it is stored twice"
-    stored = [digest_of_file(file) for file in KEPT.rglob("*") if file.is_file() and file.name != RECORD]
+    # Two paths of one stage may begin alike, and so have one picture of their start.
+    stored = [
+        digest
+        for stage in stages
+        for digest in {
+            digest_of_file(file) for file in stage.rglob("*") if file.is_file() and file.name != RECORD
+        }
+    ]
     assert len(set(stored)) == len(stored)
     assert sum(file.stat().st_size for file in KEPT.rglob("*")) < MOST_BYTES
 
