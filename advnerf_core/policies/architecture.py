@@ -21,6 +21,7 @@ from pydantic import BaseModel, Field, model_validator
 from advnerf_core.code_files import modules_beside
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.plugins import (
+    FAILURES,
     PluginError,
     absolute_reference,
     code_sha256,
@@ -158,7 +159,7 @@ class Architecture:
         configuration = _typed(made_by.Configuration, self.name, self.configuration)
         try:
             network = made_by(goal_size, max_steering_rad, configuration)
-        except Exception as error:
+        except FAILURES as error:
             if self.name in ARCHITECTURES:
                 raise
             raise ArchitectureError(
@@ -184,7 +185,7 @@ class Architecture:
             network = self.build(2, 0.3).eval()
             try:
                 network(torch.rand(2, 3, IMAGE_HEIGHT, IMAGE_WIDTH), torch.eye(2))
-            except Exception as error:
+            except FAILURES as error:
                 raise ArchitectureError(
                     f"{_WHAT} {self.name}: a call with images [2, 3, {IMAGE_HEIGHT}, {IMAGE_WIDTH}] and goals [2, 2] failed: "
                     f"{type(error).__name__}: {error}"

@@ -74,13 +74,11 @@ def check_policy(
     findings.append(runs)
     if runs.verdict == FAILURE:
         return findings
-    for look in (_finite, _answer, _repeatable, _independent, _gradient):
+    for name, look in _LOOKS:
         try:
             finding = look(examined, images)
         except Exception as error:  # such as a picture that forward changes in place
-            finding = Finding(
-                look.__name__.strip("_"), FAILURE, f"the network fails: {in_one_line(error):.160}"
-            )
+            finding = Finding(name, FAILURE, f"the network fails: {in_one_line(error):.160}")
         findings.append(finding)
         if finding.verdict == FAILURE and look in (_finite, _repeatable):
             return findings
@@ -305,6 +303,11 @@ def _slope(examined: _Examined, batch: Tensor, slopes: Tensor, step: float = 2e-
         )
         return Finding("gradient", WARNING, text)
     return Finding("gradient", OK, f"reaches the image, within {100 * error:.1f} % of finite differences")
+
+
+_LOOKS = (
+    ("finite", _finite), ("answer", _answer), ("repeatable", _repeatable), ("batch", _independent), ("gradient", _gradient),
+)  # fmt: skip
 
 
 def _range(examined: _Examined, images: NDArray[np.uint8]) -> Finding:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +12,16 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_json
 from advnerf_core.report.audit_parts import PlaceKind, Scale
 from nodes.audit.asking import UnansweredError
+from nodes.experiment.engine.artefact import hash_of
 from nodes.lab.importing.metric_options import MetricOptions
+from nodes.lab.importing.staging import work_folder
+from nodes.lab.located import content_sha256
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 
 POSES, IMPORTED, REPORT, INPUT = "transforms.json", "photos", "import.json", "imported_from.json"
 _SPLATS = (".ply", ".spz", ".splat", ".glb")
 _EXTENT_M = 1.0  # of a set without a known metre, which is then rejected
-_HEAD_BYTES = 65536
 _MOVEMENT, _MOST = 0.06, 300  # as in ``advnerf scene from-video``
 
 
@@ -90,15 +91,17 @@ def _scale_of(poses: Path) -> Scale | None:
 
 
 def _require_same_input(folder: Path, given: Path, metric: MetricOptions, has_metre: bool) -> None:
-    """Write down what is imported into an audit's folder, or check that it is what was imported there before.
+    """Write down what is imported into an audit's folder, or check that it is what was imported there before, wholly or in part.
 
     Raises:
         ConfigError: It is another place, or another metre.
     """
     file = folder / INPUT
     said = {name: str(value) for name, value in asdict(metric).items()}
-    now = {"given": str(given.resolve()), "content": _digest(given), "metric": said}
-    before = read_json(file) if file.is_file() else now
+    now = {"given": str(given.resolve()), "content": _digest(given, folder), "metric": said}
+    imported = folder / IMPORTED
+    begun = (imported / POSES).is_file() or work_folder(imported).exists()
+    before = read_json(file) if begun and file.is_file() else now
     changed = [key for key in now if before.get(key) != now[key]]
     if "given" in changed and "content" not in changed:  # the files were moved
         changed.remove("given")
@@ -114,17 +117,19 @@ def _require_same_input(folder: Path, given: Path, metric: MetricOptions, has_me
     write_json(file, now)
 
 
-def _digest(given: Path) -> str:
-    """Hash of names, sizes and first bytes of a file, or of all files of a folder: enough to notice another recording."""
-    digest = hashlib.sha256()
-    files = sorted(each for each in given.rglob("*") if each.is_file()) if given.is_dir() else [given]
-    for file in files if given.exists() else ():
-        with file.open("rb") as stream:
-            head = stream.read(_HEAD_BYTES)
-        digest.update(
-            f"{file.relative_to(given)}\0{file.stat().st_size}\0".encode() + hashlib.sha256(head).digest()
-        )
-    return digest.hexdigest()
+def _digest(given: Path, made: Path) -> str:
+    """Hash of a file, or of all files of a folder with their names.
+
+    Args:
+        made: Folder of the audit, which may lie in the folder of the place, and does not belong to it.
+    """
+    if not given.is_dir():
+        return content_sha256(given) if given.is_file() else ""
+    own = made.resolve()
+    files = [
+        each for each in sorted(given.rglob("*")) if each.is_file() and not each.resolve().is_relative_to(own)
+    ]
+    return hash_of([(str(each.relative_to(given)), content_sha256(each)) for each in files])
 
 
 def _facts(folder: Path) -> dict[str, Any]:

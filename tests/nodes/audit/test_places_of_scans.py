@@ -68,6 +68,21 @@ def test_a_length_that_is_not_needed_is_refused(tmp_path):
         posed(imported, tmp_path / "other", length("frame_00001.png", "frame_00006.png"))
 
 
+def test_a_folder_whose_import_never_began_is_free_for_another_place(tmp_path):
+    ends, audit = ("frame_00001.png", "frame_00006.png"), tmp_path / "audit"
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(AdvnerfError, match="expected photographs or a scan in it"):
+        posed(tmp_path / "empty", audit, MetricOptions())
+    assert posed(scan_samples.nerfstudio(tmp_path / "one"), audit, length(*ends)).scale == "length"
+
+
+def test_an_audit_in_the_folder_of_its_place_is_no_change_of_the_place(tmp_path):
+    scan, ends = scan_samples.nerfstudio(tmp_path), ("frame_00001.png", "frame_00006.png")
+    there = posed(scan, scan / "audit", length(*ends))
+    (scan / "audit" / "report.txt").write_text("what the audit has made since")
+    assert posed(scan, scan / "audit", length(*ends)) == there
+
+
 def test_the_photographs_of_another_place_or_metre_are_not_those_of_an_audit_s_folder(tmp_path):
     """Each import is repeated first, which takes what is there; then its place, its content or its metre changes."""
     ends, audit = ("frame_00001.png", "frame_00006.png"), tmp_path / "audit"
