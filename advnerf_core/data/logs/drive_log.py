@@ -17,7 +17,7 @@ from advnerf_core.data.logs.choice import LogChoice, LogError, Side
 Labels = Literal["expert", "recorded"]
 NOWHERE = (math.nan, math.nan, math.nan)
 # Of front wheels: at this angle and above, a value is in degrees, or in another unit.
-STEEPEST_RAD = 1.0
+_STEEPEST_RAD = 1.0
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class SteeringUnit:
                 "(the wheel angle at a value of 1, and the side of positive values)"
             )
         angle_rad = value * self.full_rad * (1.0 if self.positive == "left" else -1.0) + self.offset_rad
-        if abs(angle_rad) >= STEEPEST_RAD:
+        if abs(angle_rad) >= _STEEPEST_RAD:
             raise LogError(
-                f"{place}: expected a steering angle below {STEEPEST_RAD:g} rad, got {value:g} times {self.full_rad:g}; "
+                f"{place}: expected a steering angle below {_STEEPEST_RAD:g} rad, got {value:g} times {self.full_rad:g}; "
                 "give the wheel angle at a value of 1 with --steering-full-rad"
             )
         return angle_rad

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.data.image_files import Rgb
-from advnerf_core.data.logs.drive_log import STEEPEST_RAD, DriveLog
+from advnerf_core.data.logs.choice import LogError
+from advnerf_core.data.logs.drive_log import DriveLog
 from nodes.lab.policy_data.frames import HOLDOUT_EVERY, LEAST_FRAMES
 
 _LOOKED_AT, _LOOKING_S = 32, 3.0
@@ -65,9 +66,11 @@ class LogFacts:
             return f"the steering is always {self.steering[0]:.3g}"
         if log.unit.unknown:
             return f"give {log.unit.unknown}"
-        steepest_rad = float(np.abs(self.steering).max()) * (log.unit.full_rad or 0.0)
-        if steepest_rad >= STEEPEST_RAD:
-            return f"{steepest_rad:.3g} rad is no angle of front wheels; give the angle at a value of 1 with --steering-full-rad"
+        try:  # as training will
+            for value in (self.steering.min(), self.steering.max()):
+                log.unit.wheel_rad(float(value), log.unit.name)
+        except LogError as error:
+            return str(error)
         return (
             ""
             if self.joined

@@ -173,7 +173,7 @@ def test_what_has_no_stamps_is_joined_by_the_times_of_recording(tmp_path, unstam
         ({"late_ns": 60 * 10**9}, "no steering belongs to any of the first 20 images: their times differ"),
         (
             {"step": 1.0},
-            "19 rad is no angle of front wheels; give the angle at a value of 1 with --steering-full-rad",
+            "/drive: expected a steering angle below 1 rad, got 19 times 1; give the wheel angle at a value of 1 with --steering-full-rad",
         ),
     ],
 )
