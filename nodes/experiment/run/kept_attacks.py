@@ -1,4 +1,7 @@
-"""Attacks that are published with their cells: the attack of each search, once, as it was deployed."""
+"""Attacks that are published with their cells: the attack of each search, once, as it was deployed.
+
+Textures of many objects are large. Of those only the ones of claimed methods are published; `redrive` searches for the others again.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from advnerf_core.attack.artifact import AttackFileError, load_attack, save_attack
+from advnerf_core.attack.artifact import AttackFile, AttackFileError, load_attack, save_attack
 from advnerf_core.report.cells import CellResult, read_cell
+from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.verify import Verified
 from nodes.experiment.run.store import CellStatus, Store
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.search_files import ATTACK, is_published_with_its_attack
 
 FOLDER = "attacks"
+# A larger attack is published only if its set claims something about its method.
+SMALL_BYTES = 100_000
 
 
 def attack_file(folder: Path, attack_id: str) -> Path:
@@ -23,15 +29,18 @@ def attack_file(folder: Path, attack_id: str) -> Path:
 
 def publish_attacks(experiment: Experiment, found: Sequence[CellStatus], folder: Path) -> list[Path]:
     """Copy the attacks of finished cells that this machine has into the folder of a published set; returns the new files there."""
-    written = []
+    written, claimed = [], _claimed(folder)
     for each in found:
         if each.state != "done" or each.result is None or not is_published_with_its_attack(each.result):
             continue
         attack_id = str(each.result.attack_id)
         target = attack_file(folder, attack_id)
         source = next((file for file in _sources(experiment, each) if _id_of(file) == attack_id), None)
-        if source is not None and not target.exists():
-            save_attack(target, load_attack(source), small=True)
+        if source is None or target.exists():
+            continue
+        attack = load_attack(source)
+        if _bytes(attack) <= SMALL_BYTES or _is_of(each.result, claimed):
+            save_attack(target, attack, small=True)
             written.append(target)
     return written
 
@@ -41,12 +50,14 @@ def attack_problems(folder: Path) -> Iterator[str]:
 
     Cells from before attacks were published have none.
     """
-    used = set()
+    used, claimed = set(), _claimed(folder)
     for file in sorted(folder.glob("*.json")):
         cell = read_cell(file)
         if is_published_with_its_attack(cell):
             used.add(str(cell.attack_id))
-            yield from _problems_of(cell, attack_file(folder, str(cell.attack_id)))
+            attack = attack_file(folder, str(cell.attack_id))
+            if attack.exists() or _is_of(cell, claimed):
+                yield from _problems_of(cell, attack)
     for file in sorted((folder / FOLDER).glob("*")):
         if file.stem not in used:
             yield f"{file}: no cell was driven with this attack"
@@ -57,6 +68,24 @@ def with_attacks(verified: Verified, folder: Path) -> Verified:
     if verified.problems:  # cells that cannot be read show nothing about attacks
         return verified
     return replace(verified, problems=tuple(attack_problems(folder)))
+
+
+def _claimed(folder: Path) -> set[str]:
+    """Methods that a set's registration claims something about; none if nothing is registered or claimed."""
+    registration = read_registration(folder)
+    if registration is None:
+        return set()
+    return {each.method for each in registration.primary} | {each.method for each in registration.claims}
+
+
+def _is_of(cell: CellResult, methods: set[str]) -> bool:
+    """Whether a cell is of one of these methods; of none is every cell."""
+    return not methods or cell.method in methods
+
+
+def _bytes(attack: AttackFile) -> int:
+    """Size of its textures in half precision."""
+    return sum(2 * each.theta.size for each in attack.objects)
 
 
 def _problems_of(cell: CellResult, file: Path) -> Iterator[str]:

@@ -9,10 +9,12 @@ from advnerf_core.attack.artifact import load_attack, save_attack
 from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.hardness import PUBLISHED_FILE
 from advnerf_core.report.evidence.kept_build import LOST
+from advnerf_core.report.evidence.registration import FILE, PrimaryTest, read_registration
 from advnerf_core.report.evidence.verify import verify_set
 from nodes.experiment.engine.artefact import BUILD, RECORD, ReferenceBuild, read_artefact, write_artefact
+from nodes.experiment.run import kept_attacks
 from nodes.experiment.run.cells import keep_build
-from nodes.experiment.run.kept_attacks import attack_problems, with_attacks
+from nodes.experiment.run.kept_attacks import FOLDER, attack_problems, publish_attacks, with_attacks
 from nodes.experiment.run.plan import statuses
 from nodes.experiment.run.published import publish, publish_build
 from nodes.experiment.run.redrive import RedriveError, redrive
@@ -31,7 +33,7 @@ def experiment_in(folder, *more):
 
 @pytest.fixture
 def published(tiny_room, tmp_path, monkeypatch):
-    """Folder of a published set, of which only the published files are left."""
+    """Folder of a published set, and its experiment."""
     build, results = ReferenceBuild(tmp_path / "trained"), tmp_path / "docs" / "results"
     assert keep_build(tiny_experiment(tiny_room[0]), build)
     monkeypatch.setattr(run, "REFERENCE", build)
@@ -46,15 +48,36 @@ def published(tiny_room, tmp_path, monkeypatch):
     publish(experiment, statuses(experiment, experiment.cells), results)
     assert len(publish_build(experiment, experiment.cells, results).written) == 4
     write_set(results / experiment.config.name)
-    shutil.rmtree(experiment.folder)
     shutil.rmtree(build.folder)
     for file in (results / BUILD).glob(f"*/{RECORD}"):  # an earlier version had other keys
         write_artefact(file.parent, replace(read_artefact(file.parent), key="0" * 64))
     monkeypatch.setattr(run, "REFERENCE", ReferenceBuild(results / BUILD))
-    return results / experiment.config.name
+    return results / experiment.config.name, experiment
 
 
-def test_it_is_driven_again_from_the_published_files_alone(published, tmp_path):
+def of_claimed_methods_alone(published, experiment, monkeypatch):
+    """Whether a set that claims something of another method than its large attacks' publishes none of them, and needs none."""
+    found, folder = statuses(experiment, experiment.cells), published.parent / "large"
+    shutil.copytree(published, folder, ignore=shutil.ignore_patterns("attacks"))
+    file = folder / FILE
+    registration = read_registration(folder)
+    claimed = PrimaryTest(
+        scenario=registration.cells[0].scenario, victim="hardened", method="cem", against=("none",)
+    )
+    file.write_text(registration.model_copy(update={"primary": (claimed,)}).model_dump_json())
+    small = publish_attacks(experiment, found, folder)
+    shutil.rmtree(folder / FOLDER)
+    monkeypatch.setattr(kept_attacks, "SMALL_BYTES", 0)
+    large = publish_attacks(experiment, found, folder)
+    problems = list(attack_problems(folder))
+    shutil.rmtree(folder)
+    return len(small) == 2 and large == [] and problems == []
+
+
+def test_it_is_driven_again_from_the_published_files_alone(published, tmp_path, monkeypatch):
+    published, experiment = published
+    assert of_claimed_methods_alone(published, experiment, monkeypatch)
+    shutil.rmtree(experiment.folder)
     found = verify_set(published)
     assert with_attacks(found, published).problems == ()
     searched = [cell for cell in read_cells(published) if cell.attack_id]
