@@ -126,6 +126,7 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         if name not in experiment.world.paths:
             message = unknown(name, "path", experiment.world.paths)
             raise ConfigError(f"{document.place(('paths', index))}: paths: {message}")
+    _check_start_sigma(experiment, document)
     if experiment.config.own_scene or isinstance(experiment.named_world.make(), Photographed):
         _check_undriven(experiment, document)
     by_hand = [
@@ -143,6 +144,16 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         )
     if not given_in(experiment.config):  # existing policies are checked when the experiment is run
         _ = experiment.view
+
+
+def _check_start_sigma(experiment: Experiment, document: Document) -> None:
+    """Check that drawn starts are on the track, but for one in twenty."""
+    sigma, limit_m = experiment.config.attack.start_sigma, experiment.world.off_track_m
+    if sigma > 0.5 * limit_m:
+        raise ConfigError(
+            f"{document.place(('attack', 'start_sigma'))}: expected attack.start_sigma to be at most half of the off-track limit, "
+            f"{limit_m:g} m, got {sigma:g}; with more, drives begin off the track"
+        )
 
 
 def _check_panel(carrier: FaceCarrier, experiment: Experiment, document: Document) -> None:

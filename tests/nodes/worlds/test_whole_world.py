@@ -85,6 +85,10 @@ def test_a_mistake_in_the_file_is_one_line(
             text.replace("horizon: 50", "view: {crop_height_px: 300}\nhorizon: 50"),
             "view: expected a crop inside 336 x 188",
         ),
+        (
+            text.replace("horizon: 50", "attack: {start_sigma: 0.5}\nhorizon: 50"),
+            "attack.start_sigma to be at most half of the off-track limit, 0.6 m, got 0.5",
+        ),
     ):
         assert wrong != text
         file.write_text(wrong)
