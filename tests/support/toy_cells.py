@@ -10,7 +10,7 @@ import time
 from contextlib import nullcontext
 
 from advnerf_core.run_module import module_command
-from nodes.experiment.show.variants import Variants, resolve
+from nodes.experiment.engine.run_folder import RunFolder
 
 MODULE = "tests.support.toy_cells"
 REPLACED = ("run.cells", "steps.run", "steps.keys", "steps.steering_gate", "show.context")
@@ -18,7 +18,7 @@ FACTORS = {"none": 1.0, "random": 1.1, "cem": 2.0, "gradient": 3.0}
 Bench = nullcontext
 
 
-class Experiment(Variants):
+class Experiment(RunFolder):
     """An experiment whose section world says what its cells find."""
 
     @property
@@ -27,7 +27,7 @@ class Experiment(Variants):
 
 
 def load_experiment(file, setting, overrides, folder, executes=True):
-    return resolve(Experiment, file, setting, overrides, folder, executes, lambda made, document: made)
+    return Experiment.resolved(file, setting, overrides, folder, executes, lambda made, document: made)
 
 
 def prepare_victims(experiment):

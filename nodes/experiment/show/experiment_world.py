@@ -14,8 +14,8 @@ from advnerf_core.documents import Document, read_json
 from advnerf_core.driving.solids import Solids
 from advnerf_core.files import write_atomically
 from hardware.worlds.world import HasSolids, NotOpenError, Traits, World, WorldDescription
+from nodes.experiment.engine.run_folder import RunFolder
 from nodes.experiment.show.kept_worlds import KeptWorld, is_users, kept_world
-from nodes.experiment.show.variants import Variants
 from nodes.lab.worlds.named import NamedWorld, read_world, without
 from nodes.runtime.errors import ConfigError
 
@@ -25,7 +25,7 @@ _SHARED = ("paths", "off_track_m", "car", "camera", "T_car_from_camera", "fence_
 
 
 @dataclass(frozen=True)
-class ExperimentWorld(Variants):
+class ExperimentWorld(RunFolder):
     """One resolved experiment, or one of its variants, with its worlds."""
 
     @cached_property

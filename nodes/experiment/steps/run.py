@@ -22,7 +22,6 @@ from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import VictimUnknownError, given_in, victim_spec
 from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_worlds
-from nodes.experiment.show.variants import resolve
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.live import check_live
 from nodes.experiment.steps.pipeline import stages_of
@@ -48,7 +47,7 @@ def load_experiment(
     Raises:
         ConfigError: The file is wrong; with file, line and the valid keys.
     """
-    return resolve(Experiment, file, setting, overrides, folder, executes, _load)
+    return Experiment.resolved(file, setting, overrides, folder, executes, _load)
 
 
 def _load(experiment: Experiment, document: Document) -> Experiment:
