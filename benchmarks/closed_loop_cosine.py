@@ -24,8 +24,9 @@ from advnerf_core.documents import dump_yaml, read_json, read_yaml
 from advnerf_core.files import write_atomically, write_json
 from benchmarks.results import REPOSITORY, record_row
 from nodes.experiment.node.check import in_double
-from nodes.experiment.node.prepare import Prepared, load_request, prepare
+from nodes.experiment.node.prepare import load_request, prepare
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.attack import Prepared
 
 COMMAND = "python -m benchmarks.closed_loop_cosine RUN_FOLDER"
 HORIZONS = (10, 20, 40, 60)

@@ -33,13 +33,14 @@ from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.world import Panel, Rgb
 from nodes.bags.writer import BagWriter
-from nodes.experiment.node.prepare import Prepared, load_request, prepare
+from nodes.experiment.node.prepare import load_request, prepare
 from nodes.experiment.node.print_effect import PrintEffect, print_effect
 from nodes.experiment.node.search import run_attack
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import IdealDriving, drive_deployed
 from nodes.experiment.show.native import NativeScene
 from nodes.experiment.show.own_scene import flat_object
+from nodes.experiment.steps.attack import Prepared
 from nodes.lab.wizards.prints import KnownLength, MeasuredPrint, measure
 from nodes.runtime.messages import encode, image_message, pose_message
 from nodes.runtime.progress import ProgressDisplay

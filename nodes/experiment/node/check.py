@@ -30,10 +30,11 @@ from advnerf_core.attack.methods import alternatives, black_box_methods
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.files import write_atomically, write_json
 from nodes.experiment.node.memory import measured_mib
-from nodes.experiment.node.prepare import Prepared, prepare
+from nodes.experiment.node.prepare import prepare
 from nodes.experiment.plan.space_config import MeshShapeConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import colour_space
+from nodes.experiment.steps.attack import Prepared
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 

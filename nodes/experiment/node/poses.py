@@ -13,10 +13,10 @@ from advnerf_core.attack.pose_plots import draw_placements
 from advnerf_core.attack.spaces.places import PlaceSpace
 from advnerf_core.report.conditions import NONE
 from nodes.experiment.engine.artefact import hash_of
-from nodes.experiment.node.prepare import Prepared, prepare
+from nodes.experiment.node.prepare import prepare
 from nodes.experiment.plan.space_config import PlacesConfig
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.attack import past
+from nodes.experiment.steps.attack import Prepared, past
 from nodes.experiment.steps.pose_maps import Mapped
 from nodes.runtime.errors import ConfigError
 

@@ -15,11 +15,11 @@ from advnerf_core.attack.spaces.space import Shown
 from advnerf_core.geometry import Array
 from advnerf_core.plain import PlainData
 from advnerf_core.scene.surrogate import split_theta
-from nodes.experiment.node.prepare import Prepared, prepare
+from nodes.experiment.node.prepare import prepare
 from nodes.experiment.plan.placed import FLAT
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.own_scene import flat_object
-from nodes.experiment.steps.attack import past
+from nodes.experiment.steps.attack import Prepared, past
 from nodes.runtime.errors import ConfigError
 
 # The squash has no inverse at 0 and 1.

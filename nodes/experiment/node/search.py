@@ -20,11 +20,11 @@ from advnerf_core.plugins import name_in_results
 from nodes.experiment.engine.telling import telling
 from nodes.experiment.node.job import REQUEST, TOGETHER_STATE, is_begun
 from nodes.experiment.node.poses import draw_found
-from nodes.experiment.node.prepare import Prepared, load_request, prepare, request_text
+from nodes.experiment.node.prepare import load_request, prepare, request_text
 from nodes.experiment.plan.space_config import MeshShapeConfig, PlacesConfig
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.attack import Prepared, search_settings
 from nodes.experiment.steps.attack import attack_file as make_attack_file
-from nodes.experiment.steps.attack import search_settings
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import StageDisplay
 
@@ -202,16 +202,8 @@ def _run_together(
 
 def _keep(prepared: Prepared, result: SearchResult) -> None:
     """Write what a finished search found: the curve, of places a picture, and last the attack file, which says that the seed is done."""
-    experiment, file = prepared.experiment, attack_file(prepared.experiment.folder, prepared.seed)
-    attack = make_attack_file(
-        experiment,
-        prepared.space,
-        prepared.problem,
-        prepared.policy,
-        prepared.cell,
-        result,
-        prepared.clean_drive,
-    )
+    file = attack_file(prepared.experiment.folder, prepared.seed)
+    attack = make_attack_file(prepared, result)
     curve: dict[str, Any] = {
         "attack_id": attack.attack_id,
         "method": attack.method,

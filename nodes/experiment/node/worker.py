@@ -22,8 +22,8 @@ from advnerf_core.attack.search.search import evaluation_from_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import read_tensors
 from nodes.experiment.node.job import TOGETHER_STATE
-from nodes.experiment.node.prepare import Prepared
 from nodes.experiment.node.search import kept_request, planned_evaluations, run_attack
+from nodes.experiment.steps.attack import Prepared
 from nodes.runtime.progress import MeasuringReport
 
 TEXTURE, PREVIEW = "texture", "preview"

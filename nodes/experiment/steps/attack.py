@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -46,9 +47,54 @@ from nodes.experiment.show.victims import load_victim, told
 from nodes.experiment.steps.frozen import frozen_for, hardness_before
 from nodes.experiment.steps.keys import registered_settings
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
+from nodes.experiment.steps.shared_search import search_key
 from nodes.runtime.errors import ConfigError
 
 _STATE = "state.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """An attack, ready for the search.
+
+    Attributes:
+        cell: The victim, path and method of the attack, and the seed of starts, search and disturbances.
+        policy: The victim with its view and hash.
+    """
+
+    experiment: Experiment
+    cell: Cell
+    policy: LoadedPolicy
+    space: Space
+    problem: AttackProblem
+
+    @classmethod
+    def of(cls, experiment: Experiment, space: Space, cell: Cell) -> Prepared:
+        """The attack of a cell, with its name in the experiment."""
+        policy = load_victim(experiment, cell.victim)
+        problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
+        return cls(experiment, cell, policy, space, problem)
+
+    @property
+    def seed(self) -> int:
+        """Seed of starts, search and disturbances."""
+        return self.cell.seed
+
+    @property
+    def settings_hash(self) -> str:
+        """Hash of everything that must be the same when a search is resumed."""
+        return search_key(self.experiment, self.cell)
+
+    def with_seed(self, seed: int) -> Prepared:
+        """The same attack with another seed: other starts, other draws."""
+        problem = attack_problem(self.experiment, self.space, self.policy, self.cell.scenario, seed)
+        return replace(self, cell=replace(self.cell, seed=seed), problem=problem)
+
+    @cached_property
+    def clean_drive(self) -> CleanDrive:
+        """The victim's drive past the plain objects, from the same starts in the same scene."""
+        plain = self.space.plain
+        return clean_drive(past(self.problem, self.space, plain), plain.colours)
 
 
 def surrogate_part(
@@ -65,21 +111,19 @@ def surrogate_part(
     if kept.exists():
         found: dict[str, Any] = read_json(kept)
         return found
-    policy = load_victim(experiment, cell.victim)
-    problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
+    prepared = Prepared.of(experiment, space, cell)
     attack_id, curve, seconds, values = None, [], 0.0, {}
     if cell.searched:
-        result = _search(experiment, space, problem, cell, folder, report)
+        result = _search(prepared, folder, report)
         seconds = sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
         if experiment.config.attack.objective != CTE:
             values = {"curve_value": [evaluation.value for evaluation in result.history]}
         rounded = replace(result, theta=half_precision(result.theta))
-        attack = attack_file(experiment, space, problem, policy, cell, rounded)
-        attack_id = save_attack(folder / ATTACK, attack)
+        attack_id = save_attack(folder / ATTACK, attack_file(prepared, rounded))
     data = {
         "attack_id": attack_id,
-        "policy_sha256": policy.sha256,
+        "policy_sha256": prepared.policy.sha256,
         "hardness": hardness_before(folder),
         **surrogate_drives(experiment, space, cell, folder),
         "curve_total_cte_m": curve,
@@ -97,9 +141,7 @@ def surrogate_drives(experiment: Experiment, space: Space, cell: Cell, folder: P
     Returns:
         States ``[S, T + 1, n]``, commands ``[S, T]`` and metrics, as JSON data.
     """
-    policy = load_victim(experiment, cell.victim)
-    problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
-    shown = load_shown(space, folder, cell)
+    problem, shown = Prepared.of(experiment, space, cell).problem, load_shown(space, folder, cell)
     measured = from_measured_starts(experiment, cell.scenario, past_field(experiment, problem, space, shown))
     states, commands, scores = learned_drives(experiment, measured, shown.colours)
     return {
@@ -236,14 +278,8 @@ def planned_evaluations(experiment: Experiment) -> int:
     return (space if isinstance(space, PlacesConfig) else experiment.config.attack).evaluations
 
 
-def _search(
-    experiment: Experiment,
-    space: Space,
-    problem: AttackProblem,
-    cell: Cell,
-    folder: Path,
-    report: Callable[..., None],
-) -> SearchResult:
+def _search(prepared: Prepared, folder: Path, report: Callable[..., None]) -> SearchResult:
+    experiment, cell, problem = prepared.experiment, prepared.cell, prepared.problem
     objective = objective_key(experiment.config.attack.objective)
     settings = Settings.of(
         experiment.config,
@@ -257,21 +293,14 @@ def _search(
     budget = search_settings(experiment, method)
     told = telling(method.evaluations(problem, budget), report, objective=problem.objective)
     run = SearchRun(cell.seed, folder / _STATE, told, settings.key)
-    return space.search(cell.code, on_chosen_device(problem), budget, run)
+    return prepared.space.search(cell.code, on_chosen_device(problem), budget, run)
 
 
-def attack_file(
-    experiment: Experiment,
-    space: Space,
-    problem: AttackProblem,
-    policy: LoadedPolicy,
-    cell: Cell,
-    result: SearchResult,
-    clean: CleanDrive | None = None,
-) -> AttackFile:
-    """The attack file of a search's result; its prediction is made without disturbances. ``clean`` is the drive without attack, if it is known."""
+def attack_file(prepared: Prepared, result: SearchResult) -> AttackFile:
+    """The attack file of a search's result; its prediction is made without disturbances."""
+    experiment, space, problem = prepared.experiment, prepared.space, prepared.problem
     attack = AttackFile(
-        method=cell.method,
+        method=prepared.cell.method,
         space=space.name,
         objects=space.attacked(result.theta),
         face=None,
@@ -279,13 +308,13 @@ def attack_file(
         scene_sha256=hash_of(experiment.world_settings)
         if over_the_world(experiment)
         else scene_sha256(experiment),
-        policy_sha256=policy.sha256,
+        policy_sha256=prepared.policy.sha256,
         config_sha256=registered_settings(experiment).key,
-        seed=cell.seed,
+        seed=prepared.seed,
         predicted_total_cte_m=result.best.predicted_total_cte_m,
         software_version=version("advnerf"),
-        extra=_extra(experiment, problem, policy, cell, result),
-        clean_drive=clean or clean_drive(past(problem, space, space.plain), space.plain.colours),
+        extra=_extra(prepared, result),
+        clean_drive=prepared.clean_drive,
     )
     if space.mount is not None:
         attack = replace(attack, face=space.mount.face(attack.objects))
@@ -303,14 +332,13 @@ def attack_file(
     return replace(attack, field_total_cte_m=float(totals_m.protocol_cte_m.mean()))
 
 
-def _extra(
-    experiment: Experiment, problem: AttackProblem, policy: LoadedPolicy, cell: Cell, result: SearchResult
-) -> dict[str, Any]:
+def _extra(prepared: Prepared, result: SearchResult) -> dict[str, Any]:
     """Further data of an attack file beside its fields."""
+    experiment, problem = prepared.experiment, prepared.problem
     found = {
         "experiment": experiment.config.name,
-        "victim": cell.victim,
-        "scenario": cell.scenario,
+        "victim": prepared.cell.victim,
+        "scenario": prepared.cell.scenario,
         "horizon": experiment.searched_ticks,
         "evaluations": len(result.history),
         "start_states": problem.start_states[:, :3].tolist(),
@@ -318,6 +346,6 @@ def _extra(
         **said_of_device(),
         **objective_entry(experiment.config.attack.objective, problem.objective, result.best.value),
     }
-    if identity := policy.metadata.get("not_fixed"):
+    if identity := prepared.policy.metadata.get("not_fixed"):
         found["policy_not_fixed"] = identity
     return found

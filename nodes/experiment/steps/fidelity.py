@@ -39,7 +39,7 @@ from nodes.experiment.show.objects import surrogate_of
 from nodes.experiment.show.spaces import dress, make_space, shown_there
 from nodes.experiment.show.victims import load_victim, told
 from nodes.experiment.steps import capture
-from nodes.experiment.steps.attack import attack_problem, from_measured_starts, load_found
+from nodes.experiment.steps.attack import Prepared, from_measured_starts, load_found
 from nodes.experiment.steps.deploy import DRIVES, live_name
 from nodes.experiment.steps.search_files import ATTACK
 from nodes.runtime.errors import BagError, RuntimeFault
@@ -130,9 +130,7 @@ def loop(
     space, attack = _found(experiment, cell, folder)
     found, plain = space.restored(attack), space.plain
     with_it, without = (each.seen_by(space.surrogate) for each in (found, plain))
-    problem = attack_problem(
-        experiment, space, load_victim(experiment, cell.victim), cell.scenario, cell.seed
-    )
+    problem = Prepared.of(experiment, space, cell).problem
     car, problem = _measured_car(experiment, clean), from_measured_starts(experiment, cell.scenario, problem)
     problem = replace(problem, dynamics=car, start_states=car.start(problem.start_states))
 

@@ -28,8 +28,7 @@ from nodes.experiment.plan.maps_config import LandscapeConfig, RobustnessMapConf
 from nodes.experiment.plan.space_config import PlacesConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
-from nodes.experiment.show.victims import load_victim
-from nodes.experiment.steps.attack import attack_problem
+from nodes.experiment.steps.attack import Prepared
 from nodes.experiment.steps.keys import NoSuchCellError
 from nodes.experiment.steps.search_files import ATTACK
 from nodes.runtime.progress import Report
@@ -112,9 +111,7 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
     attack = load_attack(folder / ATTACK)
     space, name, maps = make_space(experiment, None), experiment.objects[number].name, experiment.config.maps
     assert isinstance(space.sensor, PlacedSensor), "the space of places has this sensor"
-    problem = attack_problem(
-        experiment, space, load_victim(experiment, cell.victim), cell.scenario, cell.seed
-    )
+    problem = Prepared.of(experiment, space, cell).problem
     places = torch.tensor([each.placement for each in attack.objects], dtype=torch.float64)
     # In the unit box even if only the plain colours are used.
     theta = space.sensor.join(space.sensor.space.unit(places), space.restored(attack).colours)
