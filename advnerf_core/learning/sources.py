@@ -18,7 +18,7 @@ from torch import Tensor
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.path import Array
 from advnerf_core.geometry import VehicleState
-from advnerf_core.policies.network import images_to_tensor
+from advnerf_core.policies.network import images_to_tensor, tensor_to_images
 from advnerf_core.policies.view import Image, PolicyView
 
 Steer = Callable[[Image], Array]
@@ -209,9 +209,9 @@ class RenderedSource:
     def _seen(self, states: Array, rng: np.random.Generator, held: Any) -> tuple[PolicyImages, Image, Image]:
         """Plain and (where they differ) textured views; and per state the plain view and the view with the held texture."""
         show = self._prepare(states)
-        plain = _as_uint8(show(None))
-        painted = plain if held is None else _as_uint8(show(held))
-        drawn = plain if self._sample is None else _as_uint8(show(self._sample(rng)))
+        plain = tensor_to_images(show(None))
+        painted = plain if held is None else tensor_to_images(show(held))
+        drawn = plain if self._sample is None else tensor_to_images(show(self._sample(rng)))
         images, rows, textured = [], [], []
         for row in range(len(states)):
             in_view = not np.array_equal(drawn[row], plain[row])
@@ -219,12 +219,6 @@ class RenderedSource:
             rows += [row] * (1 + in_view)
             textured += [False, True] if in_view else [False]
         return PolicyImages(np.stack(images), states[rows].copy(), np.array(textured)), plain, painted
-
-
-def _as_uint8(images: Tensor) -> Image:
-    # NumPy: torch would wake its threads for each of these small steps.
-    levels = np.clip(images.numpy(), 0.0, 1.0) * np.float32(255.0)
-    return np.ascontiguousarray(np.rint(levels, out=levels).astype(np.uint8).transpose(0, 2, 3, 1))
 
 
 def steer_with(policy: Any, goals: Tensor | None = None) -> Steer:

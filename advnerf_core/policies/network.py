@@ -125,3 +125,10 @@ def images_to_tensor(images: NDArray[np.uint8]) -> Tensor:
         batch = batch.copy()  # torch warns about read-only buffers
     # The memory stays channels-last, which is also the faster layout for the convolutions.
     return torch.from_numpy(batch).permute(0, 3, 1, 2).to(torch.float32).div(255.0)
+
+
+def tensor_to_images(images: Tensor) -> NDArray[np.uint8]:
+    """Images ``[B, H, W, 3]`` uint8 of a tensor ``[B, 3, H, W]`` RGB 0..1."""
+    # NumPy: torch would wake its threads for each of these small steps.
+    levels = np.clip(images.detach().numpy(), 0.0, 1.0) * np.float32(255.0)
+    return np.ascontiguousarray(np.rint(levels, out=levels).astype(np.uint8).transpose(0, 2, 3, 1))

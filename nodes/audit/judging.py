@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.attack.artifact import face_texture, load_attack
 from advnerf_core.geometry import Array, planar_poses
+from advnerf_core.policies.network import tensor_to_images
 from advnerf_core.report.audit_parts import (
     AuditedDrives,
     Control,
@@ -43,7 +44,6 @@ from nodes.audit.drives import (
 )
 from nodes.audit.verdict import ArmDrives, EffectJudgement, effect_of, judge
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.placing import clean_poses
 from nodes.experiment.show.spaces import dress, shown_there
@@ -231,7 +231,7 @@ def seen_on(experiment: Experiment, arm: Arm, states: Array, world: World | None
         whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, arm.shown.objects)
         colours = arm.shown.colours if arm.shown.objects else None
         poses = planar_poses(np.asarray(states, dtype=np.float64)) @ experiment.mount
-        return [as_uint8(whole.render(pose[None], colours).images[0]) for pose in poses]
+        return [tensor_to_images(whole.render(pose[None], colours).images)[0] for pose in poses]
     dressed = dress(experiment, world, arm.shown)
     attack = None if arm.attack is None else load_attack(arm.attack)
     colours = shown_there(experiment, arm.shown, attack)

@@ -13,11 +13,11 @@ from rich.console import Console
 from advnerf_core.attack.spaces.space import Shown
 from advnerf_core.documents import read_json
 from advnerf_core.geometry import Array
+from advnerf_core.policies.network import tensor_to_images
 from advnerf_core.report.audit_result import AuditFidelity
 from nodes.audit.drives import pictures_along
 from nodes.audit.question import HALF, OTHER_HALF, VICTIM, AuditedQuestion, half_overrides
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.learned_scene import FIDELITY
 from nodes.experiment.show.placing import clean_poses
 from nodes.experiment.show.victims import load_victim, told
@@ -122,5 +122,5 @@ def _apart(one: Experiment, other: Experiment) -> str:
 
 def _steering_along(experiment: Experiment, poses: Array) -> NDArray[np.float64]:
     policy = load_victim(experiment, VICTIM).policy
-    pictures = np.stack([as_uint8(each) for each in pictures_along(experiment, poses, _EMPTY)])
+    pictures = tensor_to_images(pictures_along(experiment, poses, _EMPTY))
     return predict(policy, pictures, told(experiment, policy, experiment.config.paths[0]))

@@ -19,7 +19,7 @@ from advnerf_core.driving.expert import Expert
 from advnerf_core.geometry import invert_transform, yaw_of
 from advnerf_core.policies.adapter import AdaptedPolicy
 from advnerf_core.policies.conformance import FAILURE, OK, WARNING, Finding, Verdict
-from advnerf_core.policies.network import images_to_tensor
+from advnerf_core.policies.network import images_to_tensor, tensor_to_images
 from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
 from nodes.bags.decoded import read_poses
@@ -163,7 +163,7 @@ def from_scene(scene: Path, calibration: Path, view: PolicyView, count: int = 48
     expert = _expert(calibration / "room.yaml")
     poses = _about_the_path(expert, count)
     seen = _sight_of_scene(scene, calibration, view)(torch.from_numpy(poses))
-    images = np.round(255.0 * seen.permute(0, 2, 3, 1).clamp(0.0, 1.0).numpy()).astype(np.uint8)
+    images = tensor_to_images(seen)
     drives = _drives_in_scene(scene, calibration, view)
     return ReferenceFrames(
         images, np.asarray(expert.steer_states(poses)), f"{count} frames of {scene}", drives, True

@@ -21,6 +21,7 @@ from advnerf_core.attack.search.record import Evaluation
 from advnerf_core.attack.search.search import evaluation_from_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import read_tensors
+from advnerf_core.policies.network import tensor_to_images
 from nodes.experiment.node.job import TOGETHER_STATE
 from nodes.experiment.node.search import kept_request, planned_evaluations, run_attack
 from nodes.experiment.steps.attack import Prepared
@@ -94,8 +95,8 @@ class Speaker:
         texture = _texture(prepared, theta)
         if texture is not None:
             self._image(TEXTURE, texture)
-        seen = prepared.problem.sensor.sense(prepared.problem.start_states[:1], theta).images[0]
-        pixels = np.round(255.0 * seen.detach().permute(1, 2, 0).clamp(0.0, 1.0).numpy()).astype(np.uint8)
+        seen = prepared.problem.sensor.sense(prepared.problem.start_states[:1], theta).images
+        pixels = tensor_to_images(seen)[0]
         self._image(PREVIEW, pixels.repeat(_PREVIEW_SCALE, 0).repeat(_PREVIEW_SCALE, 1))
 
     def _best_theta(self, prepared: Prepared) -> Tensor | None:

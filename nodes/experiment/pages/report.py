@@ -15,6 +15,7 @@ from rich.console import Console
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.documents import read_json
 from advnerf_core.geometry import planar_poses
+from advnerf_core.policies.network import tensor_to_images
 from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.data import ReportData
@@ -32,7 +33,6 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import know_methods_of
 from nodes.experiment.plan.object_kinds import name_of
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.overview import from_above
 from nodes.experiment.show.spaces import make_space
 from nodes.experiment.steps import films, memory
@@ -175,5 +175,5 @@ def seen_where_learned(experiment: Experiment, space: Space, scenario: str) -> d
     for method in (NONE, *experiment.config.method_names):
         cell = Cell(scenario, victim, method, 0 if method == NONE else seed)
         pictures = rendered(load_shown(space, driven_folder(experiment, cell), cell))[best]
-        seen[method] = np.concatenate([as_uint8(each) for each in pictures], axis=1)
+        seen[method] = np.concatenate(tensor_to_images(pictures), axis=1)
     return seen

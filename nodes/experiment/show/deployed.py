@@ -24,12 +24,11 @@ from advnerf_core.driving.rollout import Remembering, drive
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.learning.sources import Show
-from advnerf_core.policies.network import Policy, images_to_tensor
+from advnerf_core.policies.network import Policy, images_to_tensor, tensor_to_images
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import PoseBatch, Surrogate
 from hardware.cameras.effects import ImperfectCamera
 from hardware.worlds.world import Rgb, World, collided_with, require_depth
-from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.standing import bare_views, clear
 
 # At a camera's own resolution a rasteriser takes one ray per pixel; the policy's resize averages three of them.
@@ -115,7 +114,7 @@ class DressedScene(Dressed):
     def policy_images(self, frames: PoseBatch, theta: Tensor | None) -> NDArray[np.uint8]:
         """See `Dressed.policy_images`."""
         shown = self._window.plain_theta() if theta is None and self._window.objects else theta
-        return np.stack([self._resized(as_uint8(image)) for image in frames.render(shown).images])
+        return np.stack([self._resized(image) for image in tensor_to_images(frames.render(shown).images)])
 
     def seen_now(self, theta: Tensor | None) -> NDArray[np.uint8]:
         """See `Dressed.seen_now`."""
@@ -127,12 +126,12 @@ class DressedScene(Dressed):
         image = self._window.overlay(
             rgb[window][None] / np.float32(255.0), depth_m[window][None], pose, theta
         )
-        return self._resized(as_uint8(image[0]))
+        return self._resized(tensor_to_images(image)[0])
 
     def camera_image(self, state: Array, theta: Tensor | None) -> NDArray[np.uint8]:
         """See `Dressed.camera_image`."""
         poses = self._whole.camera_poses(torch.from_numpy(np.asarray(state, dtype=np.float64))[None])
-        return as_uint8(self._whole.render(poses, theta).images[0])
+        return tensor_to_images(self._whole.render(poses, theta).images)[0]
 
     def _resized(self, window: NDArray[np.uint8]) -> NDArray[np.uint8]:
         resized = cv2.resize(window, (self.view.width, self.view.height), interpolation=cv2.INTER_AREA)

@@ -25,6 +25,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.measured_car import CarResponse, RespondingCar, fit_response
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
+from advnerf_core.policies.network import tensor_to_images
 from advnerf_core.scene.fidelity import PicturePairs
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import Rgb
@@ -34,7 +35,6 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.faces import face_space, has_face, on_screen, panel_of
-from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.objects import surrogate_of
 from nodes.experiment.show.spaces import dress, make_space, shown_there
 from nodes.experiment.show.victims import load_victim, told
@@ -60,9 +60,9 @@ def held_out(experiment: Experiment) -> PicturePairs:
     """Held-out views of the driving camera, around all drives, without objects."""
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT, require_all=True).load()
     surrogate = surrogate_of(experiment, [])
-    learned = [as_uint8(surrogate.render(pose[None], None).images[0]) for pose in views.T_world_from_camera]
+    learned = _learned(surrogate, views.T_world_from_camera, None)
     return PicturePairs(
-        "held-out views", np.stack([experiment.view.image(rgb) for rgb in views.rgb]), np.stack(learned)
+        "held-out views", np.stack([experiment.view.image(rgb) for rgb in views.rgb]), learned
     )
 
 
@@ -190,7 +190,7 @@ def _overlay(experiment: Experiment, attack: AttackFile) -> FaceOverlay:
 
 
 def _learned(sensor: Surrogate, poses: Array, theta: torch.Tensor | None) -> Rgb:
-    return np.stack([as_uint8(sensor.render(pose[None], theta).images[0]) for pose in poses])
+    return np.concatenate([tensor_to_images(sensor.render(pose[None], theta).images) for pose in poses])
 
 
 def _along_the_drive(

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.documents import read_json
 from advnerf_core.geometry import Array, planar_poses
+from advnerf_core.policies.network import tensor_to_images
 from advnerf_core.report.clips import ClipTrack, write_clip, write_film
 from advnerf_core.report.conditions import NONE, compared, style_of
 from advnerf_core.report.data import Film
 from hardware.worlds.world import World
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.images import as_uint8
 from nodes.experiment.steps.attack import dress_cell, load_shown
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.keys import driven_folder
@@ -68,7 +68,7 @@ def _learned_track(experiment: Experiment, space: Space, cell: Cell, title: str,
     states, shown = _states(folder / SEARCHED)[0][::every], load_shown(space, folder, cell)
     sensor = shown.seen_by(space.surrogate)
     poses = planar_poses(states) @ experiment.mount
-    frames = [as_uint8(sensor.render(pose[None], shown.colours).images[0]) for pose in poses]
+    frames = [tensor_to_images(sensor.render(pose[None], shown.colours).images)[0] for pose in poses]
     return _track(experiment, cell, title, frames, states)
 
 

@@ -24,14 +24,13 @@ from advnerf_core.geometry import planar_pose
 from advnerf_core.learning.imitation import ImitationProgress, Learned, train_policy
 from advnerf_core.learning.recipe import ImitationConfig, SourcePlan
 from advnerf_core.learning.sources import FrameSource, RenderedSource, SceneSource, Show
-from advnerf_core.policies.network import Policy, images_to_tensor
+from advnerf_core.policies.network import Policy, images_to_tensor, tensor_to_images
 from advnerf_core.policies.policy_file import load_policy
 from hardware.worlds.world import World
 from nodes.experiment.plan.victims import HARDENED, NAIVE
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed, seen_in
 from nodes.experiment.show.faces import PaintedScene, face_object, face_space, has_face
-from nodes.experiment.show.images import as_uint8
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.light import light_on_panels
 from nodes.experiment.show.native import stand_in
@@ -280,6 +279,6 @@ def write_placement(experiment: Experiment, folder: Path) -> None:
     dressed = surrogate_of(experiment, attacked, background)
     for name, reference in experiment.references.items():
         pose = (planar_pose(*reference.drive_start) @ experiment.mount)[None]
-        with_objects = dressed.render(pose, dressed.plain_theta()).images[0]
-        write_image(folder / f"{name}_start_view.png", as_uint8(bare.render(pose, None).images[0]))
-        write_image(folder / f"{name}_start_view_with_objects.png", as_uint8(with_objects))
+        with_objects = dressed.render(pose, dressed.plain_theta()).images
+        write_image(folder / f"{name}_start_view.png", tensor_to_images(bare.render(pose, None).images)[0])
+        write_image(folder / f"{name}_start_view_with_objects.png", tensor_to_images(with_objects)[0])
