@@ -140,7 +140,7 @@ def _needed_stages(experiment: Experiment) -> list[Stage]:
 
 def runs_alone(experiment: Experiment) -> bool:
     """Whether a cell needs the machine for itself: live nodes measure time, and a server steps one world at a time."""
-    exclusive = experiment.deployed_traits.exclusive or experiment.traits.exclusive
+    exclusive = experiment.known_deployed.traits.exclusive or experiment.traits.exclusive
     return exclusive or experiment.config.deploy.live
 
 

@@ -56,18 +56,9 @@ class ExperimentWorld(RunFolder):
         return self._known_world.traits
 
     @cached_property
-    def _known_deployed(self) -> NamedWorld | KeptWorld:
+    def known_deployed(self) -> NamedWorld | KeptWorld:
+        """The deployment's world, of which settings and traits are known before it is opened."""
         return self._known(self.config.deploy.world or self.config.world)
-
-    @property
-    def deployed_traits(self) -> Traits:
-        """Properties of the deployment's world that are known before it is opened."""
-        return self._known_deployed.traits
-
-    @property
-    def deployed_settings(self) -> dict[str, Any]:
-        """Settings of the deployment's world that results depend on, as JSON data."""
-        return self._known_deployed.settings
 
     @cached_property
     def solids(self) -> Solids | None:

@@ -123,7 +123,7 @@ def _common_inputs(experiment: Experiment, deployed: bool = True) -> dict[str, A
         "version": VERSION,
         "bake": bake.VERSION,
         "world": experiment.seen_settings if seen else experiment.world_settings,
-        "deployed_world": experiment.deployed_settings if deployed and config.deploy.world else None,
+        "deployed_world": experiment.known_deployed.settings if deployed and config.deploy.world else None,
         "view": experiment.view_settings,
     }
 
