@@ -14,7 +14,6 @@ from torch import Tensor
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.robustness import Disturbances
 from advnerf_core.attack.spaces.space import ColourSpace, Shown
-from advnerf_core.data.transforms import load_transforms
 from advnerf_core.driving.metrics import DriveMetrics
 from advnerf_core.fields.voxel_grid import inverse_squash
 from advnerf_core.geometry import Array
@@ -23,7 +22,7 @@ from nodes.audit.question import VICTIM
 from nodes.audit.verdict import ArmDrives
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.drives import deployed_drives, learned_drives
-from nodes.experiment.show.learned_scene import HELD_OUT
+from nodes.experiment.show.learned_scene import HELD_OUT, captured
 from nodes.experiment.show.spaces import colour_space, dress, shown_there
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem, from_measured_starts
@@ -80,7 +79,7 @@ def red_all_over(experiment: Experiment) -> Shown:
 def _picture(experiment: Experiment, space: ColourSpace) -> Tensor:
     """Colours of the object that show a photograph of the place, the middle of the first held-out view."""
     plain = space.plain.colours
-    views = load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True).load()
+    views = captured(experiment, HELD_OUT).load()
     rgb = np.asarray(views.rgb[0])
     side = min(rgb.shape[:2])
     top, left = (rgb.shape[0] - side) // 2, (rgb.shape[1] - side) // 2

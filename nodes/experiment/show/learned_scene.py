@@ -59,7 +59,7 @@ def compare_views(experiment: Experiment, view: PolicyView, begin: float, report
     PSNR and SSIM are taken at the camera's size and at the policy's: there the field's own render against the resized image.
     """
     folder, renderer = experiment.stage_folder("scene"), load_field(experiment)
-    listed = _held_out(experiment)
+    listed = captured(experiment, HELD_OUT)
     views, rows = listed.load(), []
     for index, (real, pose) in enumerate(zip(views.rgb, views.T_world_from_camera, strict=True)):
         report(begin + (1 - begin) * index / len(views.rgb), f"held-out view {index + 1}")
@@ -82,14 +82,15 @@ def compare_views(experiment: Experiment, view: PolicyView, begin: float, report
 
 def view_pictures(experiment: Experiment, index: int) -> dict[str, NDArray[np.uint8]]:
     """A held-out view at the camera's size, ``real`` and ``surrogate``, drawn again: a reference build stores no pictures of it."""
-    frame = _held_out(experiment).frames[index]
+    frame = captured(experiment, HELD_OUT).frames[index]
     real, pinhole = load_image(frame)
     full = load_field(experiment).render(frame.T_world_from_camera[None], pinhole)[0][0].numpy()
     return {"real": real, "surrogate": _pixels(full)}
 
 
-def _held_out(experiment: Experiment) -> PosedImages:
-    return load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True)
+def captured(experiment: Experiment, name: str) -> PosedImages:
+    """A set of the capture stage by its name, such as `HELD_OUT`."""
+    return load_transforms(experiment.stage_folder("capture") / name, require_all=True)
 
 
 def _pixels(image: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:

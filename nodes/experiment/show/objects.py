@@ -13,7 +13,7 @@ from advnerf_core.attack.search.textures import TRAINED_WITH
 from advnerf_core.fields.colour_grid import colour_grid
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
-from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.geometry import Array
 from advnerf_core.objects.voxel.build import build_from_mesh
 from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh import SurfaceMesh, stand
@@ -114,18 +114,6 @@ def surrogate_of(
     if experiment.given_scene is not None:
         given["depth_tolerance_m"] = experiment.named_world.config.depth_tolerance_m
     return Surrogate(render, experiment.view.pinhole, experiment.mount, objects, **given)
-
-
-def last_result_kept(render: BackgroundRenderer) -> BackgroundRenderer:
-    """The same renderer with a cache of its last result (for plain and textured views of one state)."""
-    last: list[tuple[Array, Pinhole, Any]] = []
-
-    def remembered(poses: Array, pinhole: Pinhole) -> Any:
-        if not (last and last[0][1] == pinhole and np.array_equal(last[0][0], poses)):
-            last[:] = [(poses.copy(), pinhole, render(poses, pinhole))]
-        return last[0][2]
-
-    return remembered
 
 
 def random_textures(

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_json
 from advnerf_core.geometry import Array, planar_poses
@@ -15,7 +14,7 @@ from advnerf_core.scene.baked import BakedScene
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.splats.scene_file import bake_scene
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.learned_scene import FIDELITY, HELD_OUT, baked_file, load_field
+from nodes.experiment.show.learned_scene import FIDELITY, HELD_OUT, baked_file, captured, load_field
 from nodes.experiment.steps.capture import states_about
 from nodes.runtime.progress import Report
 
@@ -41,49 +40,30 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         write_json(folder / COMPARED, {"used": False, "why": str(error)})
         return
     report(0.8, "comparing")
-    if experiment.given_scene is not None:
-        _compare_with_splat(experiment, baked, folder)
-        return
+    used, found = (_beside_views if experiment.given_scene is None else _beside_splat)(experiment, baked)
+    if used:
+        baked.save(baked_file(experiment))
+    write_json(folder / COMPARED, {"used": used, **found, "mib": baked.voxels.nbytes / 2**20})
+
+
+def _beside_views(experiment: Experiment, baked: BakedScene) -> tuple[bool, dict[str, float]]:
+    """Whether a baked scene is used, and by what: the loss by baking on held-out views."""
     fidelity = read_json(experiment.stage_folder("scene") / FIDELITY)
     before_db, after_db = fidelity["mean"]["psnr_policy_db"], _held_out_psnr_db(experiment, baked)
     most_lost_db = float(_MOST_LOST_DB[experiment.config.measure.scene])
-    used = before_db - after_db <= most_lost_db
-    if used:
-        baked.save(baked_file(experiment))
-    found = {
-        "used": used,
-        "psnr_field_db": before_db,
-        "psnr_baked_db": after_db,
-        "most_lost_db": most_lost_db,
-        "mib": baked.voxels.nbytes / 2**20,
-    }
-    write_json(folder / COMPARED, found)
+    found = {"psnr_field_db": before_db, "psnr_baked_db": after_db, "most_lost_db": most_lost_db}
+    return before_db - after_db <= most_lost_db, found
 
 
-def _compare_with_splat(experiment: Experiment, baked: BakedScene, folder: Path) -> None:
+def _beside_splat(experiment: Experiment, baked: BakedScene) -> tuple[bool, dict[str, float]]:
     """The same for a splat, of which there are no held-out views: it is compared itself."""
-    splat, views, pinhole = (
-        load_field(experiment),
-        views_of(experiment)[:: _VIEWS // _COMPARED_VIEWS],
-        experiment.view.pinhole,
-    )
+    splat, pinhole = load_field(experiment), experiment.view.pinhole
     found_db = [
         psnr(baked.render(pose[None], pinhole)[0].numpy(), splat.render(pose[None], pinhole)[0].numpy())
-        for pose in views
+        for pose in views_of(experiment)[:: _VIEWS // _COMPARED_VIEWS]
     ]
     mean_db = float(np.mean(found_db))
-    used = mean_db >= _LEAST_ALIKE_DB
-    if used:
-        baked.save(baked_file(experiment))
-    write_json(
-        folder / COMPARED,
-        {
-            "used": used,
-            "psnr_to_splat_db": mean_db,
-            "least_db": _LEAST_ALIKE_DB,
-            "mib": baked.voxels.nbytes / 2**20,
-        },
-    )
+    return mean_db >= _LEAST_ALIKE_DB, {"psnr_to_splat_db": mean_db, "least_db": _LEAST_ALIKE_DB}
 
 
 def views_of(experiment: Experiment) -> Array:
@@ -97,7 +77,7 @@ def views_of(experiment: Experiment) -> Array:
 
 def _held_out_psnr_db(experiment: Experiment, baked: BakedScene) -> float:
     """Mean over the held-out views in the policy's view."""
-    views = load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True).load()
+    views = captured(experiment, HELD_OUT).load()
     view = experiment.view
     pairs = zip(views.rgb, views.T_world_from_camera, strict=True)
     return float(

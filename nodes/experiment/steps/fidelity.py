@@ -20,7 +20,6 @@ from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.attack.transfer import AttackableScene
-from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import read_json
 from advnerf_core.driving.measured_car import CarResponse, RespondingCar, fit_response
 from advnerf_core.driving.metrics import Horizon
@@ -35,10 +34,10 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.faces import face_space, has_face, on_screen, panel_of
+from nodes.experiment.show.learned_scene import HELD_OUT, captured
 from nodes.experiment.show.objects import surrogate_of
 from nodes.experiment.show.spaces import dress, make_space, shown_there
 from nodes.experiment.show.victims import load_victim, told
-from nodes.experiment.steps import capture
 from nodes.experiment.steps.attack import Prepared, from_measured_starts, load_found
 from nodes.experiment.steps.deploy import DRIVES, live_name
 from nodes.experiment.steps.search_files import ATTACK
@@ -58,7 +57,7 @@ def policy_of(experiment: Experiment, cell: Cell) -> tuple[Any, tuple[float, ...
 
 def held_out(experiment: Experiment) -> PicturePairs:
     """Held-out views of the driving camera, around all drives, without objects."""
-    views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT, require_all=True).load()
+    views = captured(experiment, HELD_OUT).load()
     surrogate = surrogate_of(experiment, [])
     learned = _learned(surrogate, views.T_world_from_camera, None)
     return PicturePairs(

@@ -26,6 +26,7 @@ from advnerf_core.learning.recipe import ImitationConfig, SourcePlan
 from advnerf_core.learning.sources import FrameSource, RenderedSource, SceneSource, Show
 from advnerf_core.policies.network import Policy, images_to_tensor, tensor_to_images
 from advnerf_core.policies.policy_file import load_policy
+from advnerf_core.scene.remembered import RememberedBackground, frame_bytes
 from hardware.worlds.world import World
 from nodes.experiment.plan.victims import HARDENED, NAIVE
 from nodes.experiment.show.context import Experiment
@@ -36,7 +37,6 @@ from nodes.experiment.show.light import light_on_panels
 from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import (
     describe,
-    last_result_kept,
     placed_objects,
     random_textures,
     surrogate_of,
@@ -51,6 +51,7 @@ from nodes.runtime.progress import MeasuringReport, Point
 _STILLS_M, _DRIVES_M, _GIVE_UP_M = 1.6, 0.8, 3.0
 # Pixels of a face in training: as many as its nearest view has.
 _TRAINING_TEXTURE_PX = 128
+_KEPT_FRAMES = 64  # of the learned scene: more than any batch of a source
 
 Sample = Callable[[np.random.Generator], torch.Tensor]
 
@@ -235,7 +236,11 @@ def _any_face(experiment: Experiment, space: FaceSpace) -> Sample:
 
 def _seen_face(experiment: Experiment) -> tuple[FaceSpace, Callable[[Array], Show]]:
     """The face in the learned scene, behind the display if a screen shows it, and the policy's view of it."""
-    space = face_space(experiment, last_result_kept(load_background(experiment)), ideal=False)
+    # Plain and attacked views of the same states have the same background.
+    background = RememberedBackground(
+        load_background(experiment), _KEPT_FRAMES * frame_bytes(experiment.view.pinhole)
+    )
+    space = face_space(experiment, background, ideal=False)
     surrogate, bare, sensor = space.surrogate, space.plain.seen_by(space.surrogate), space.sensor
 
     def seen(states: Array) -> Show:

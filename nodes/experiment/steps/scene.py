@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.scene.colour import ColourMap, fit_colour_map
@@ -18,7 +17,7 @@ from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, TrainedScene, TrainingReport, train_scene
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.learned_scene import compare_views, scene_file
+from nodes.experiment.show.learned_scene import captured, compare_views, scene_file
 from nodes.experiment.steps import capture
 from nodes.runtime.progress import MeasuringReport, Point
 
@@ -28,9 +27,7 @@ _TRAINING_SHARE = 0.97
 def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
     """Write ``scene.safetensors``, and ``fidelity.json`` with pictures of true and learned views."""
     config = experiment.config.scene
-    photographs = load_transforms(
-        experiment.stage_folder("capture") / capture.PHOTOS, require_all=True
-    ).load()
+    photographs = captured(experiment, capture.PHOTOS).load()
 
     def progress(at: TrainingReport) -> None:
         text = f"step {at.step}, {at.psnr_db:.1f} dB on training rays"
@@ -68,9 +65,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
 
 def _colour_map(experiment: Experiment, trained: TrainedScene) -> ColourMap:
     """Map from the photographs' colours to the driving camera's, fitted to views of the same places."""
-    pairs = load_transforms(
-        experiment.stage_folder("capture") / capture.COLOUR_PAIRS, require_all=True
-    ).load()
+    pairs = captured(experiment, capture.COLOUR_PAIRS).load()
     bare = FieldRenderer(trained.scene, trained.occupied, trained.march)
     return fit_colour_map(render_like(bare, pairs), pairs.rgb)
 
