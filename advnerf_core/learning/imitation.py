@@ -15,16 +15,21 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from advnerf_core.documents import read_json
 from advnerf_core.driving.expert import Expert
-from advnerf_core.driving.path import Array, Path
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
-from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
-from advnerf_core.learning.recipe import ImitationConfig, SourcePlan, TrainedPolicy, recovery_states
-from advnerf_core.learning.sources import KeepDriving, PolicyImages, steer_with
+from advnerf_core.learning.frames import FrameSet, FrameStore, FrameStoreError
+from advnerf_core.learning.recipe import (
+    ImitationConfig,
+    SourcePlan,
+    TrainedPolicy,
+    labelled,
+    near,
+    recovery_states,
+)
+from advnerf_core.learning.sources import PolicyImages, steer_with
 from advnerf_core.policies.network import SteeringNetwork
 from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.policies.view import PolicyView
@@ -183,7 +188,9 @@ class _Recipe:
             size = max(2, plan.source.batch_size)
             for first in range(0, plan.drives, size):
                 batch = starts[first : first + size]
-                parts.append(plan.source.drive(steer, batch, plan.drive_steps, self._near(path), rng))
+                parts.append(
+                    plan.source.drive(steer, batch, plan.drive_steps, near(path, config.give_up_m), rng)
+                )
                 work = 0.02 * len(batch) * plan.drive_steps
                 self._advance(work, f"driving: {plan.source.name} {first + len(batch)}/{plan.drives}")
             return parts
@@ -192,13 +199,6 @@ class _Recipe:
 
     def _expert_of(self, plan: SourcePlan) -> Expert:
         return plan.expert or self.expert
-
-    def _near(self, path: Path) -> KeepDriving:
-        def near(states: Array) -> NDArray[np.bool_]:
-            close: NDArray[np.bool_] = np.abs(path.project(states[:, :2]).cte_m) <= self.config.give_up_m
-            return close
-
-        return near
 
     def _collect(
         self, name: str, plan: SourcePlan, looks: int, collect: Callable[[], list[PolicyImages]]
@@ -209,10 +209,7 @@ class _Recipe:
             self._advance(0.02 * looks, f"frames {name} are there")
             return
         start = time.perf_counter()
-        seen = PolicyImages.join(collect())
-        labels = self._expert_of(plan).steer_states(seen.states).astype(np.float32)
-        goals = np.tile(np.array(plan.goal, np.float32), (len(labels), 1))
-        self.store.append(name, Frames(seen.images, seen.states, labels, goals, seen.textured))
+        self.store.append(name, labelled(collect(), self._expert_of(plan), plan.goal))
         self.seconds["collect"] += time.perf_counter() - start
 
     def _frames(self, textured: bool) -> FrameSet:

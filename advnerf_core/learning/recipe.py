@@ -11,7 +11,8 @@ import numpy as np
 from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Array, Path
 from advnerf_core.learning.augment import AugmentConfig
-from advnerf_core.learning.sources import FrameSource
+from advnerf_core.learning.frames import Frames
+from advnerf_core.learning.sources import FrameSource, KeepDriving, PolicyImages
 from advnerf_core.policies.architecture import Architecture
 
 
@@ -141,3 +142,16 @@ def recovery_states(
     pose[:, 1] += lateral * np.cos(pose[:, 2])
     pose[:, 2] += heading
     return pose
+
+
+def near(path: Path, give_up_m: float) -> KeepDriving:
+    """Whether cars are still this close to a path [m]."""
+    return lambda states: np.abs(path.project(states[:, :2]).cte_m) <= give_up_m
+
+
+def labelled(parts: list[PolicyImages], expert: Expert, goal: tuple[float, ...]) -> Frames:
+    """Frames of what was seen, in one shard, with the controls of a teacher."""
+    seen = PolicyImages.join(parts)
+    labels = expert.steer_states(seen.states).astype(np.float32)
+    goals = np.tile(np.array(goal, np.float32), (len(labels), 1))
+    return Frames(seen.images, seen.states, labels, goals, seen.textured)

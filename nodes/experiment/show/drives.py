@@ -9,7 +9,8 @@ import numpy as np
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
-from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
+from advnerf_core.attack.objective import JudgedDrives
+from advnerf_core.driving.metrics import DriveMetrics
 from advnerf_core.geometry import Array
 from advnerf_core.policies.network import Policy
 from hardware.cameras.effects import ImperfectCamera
@@ -20,23 +21,12 @@ from nodes.experiment.show.victims import told
 
 def learned_drives(
     experiment: Experiment, problem: AttackProblem, theta: Tensor
-) -> tuple[Array, Array, list[DriveMetrics]]:
+) -> tuple[Array, Array, Sequence[DriveMetrics]]:
     """States ``[B, T + 1, n]`` and commands ``[B, T]`` of the drives from all starts of a problem in its own scene, and their metrics."""
     rollout, _ = evaluate(problem, theta)
     states, commands = (each.transpose(0, 1).numpy() for each in (rollout.states, rollout.controls))
-    scores = [
-        drive_metrics(problem.path, each, experiment.limits, _fenced_tick(experiment, each))
-        for each in states
-    ]
-    return states, commands, scores
-
-
-def _fenced_tick(experiment: Experiment, states: Array) -> int | None:
-    """The tick at which the car leaves the world's fence and is stopped; None if it never does."""
-    if experiment.world.fence_m is None:
-        return None
-    outside = np.flatnonzero((np.abs(states[:, :2]) > experiment.world.fence_m).any(axis=1))
-    return int(outside[0]) if outside.size else None
+    judged = JudgedDrives(rollout.states, problem.path, experiment.limits, experiment.world.fence_m)
+    return states, commands, judged.metrics
 
 
 def deployed_drives(

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.methods import SearchRun
@@ -24,12 +23,11 @@ from advnerf_core.attack.on_device import on_chosen_device
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.spaces.space import ColourSpace
 from advnerf_core.documents import read_json
-from advnerf_core.driving.path import Array
 from advnerf_core.files import write_json
 from advnerf_core.learning.frames import Frames, FrameStore
-from advnerf_core.learning.recipe import SourcePlan, recovery_states
+from advnerf_core.learning.recipe import SourcePlan, labelled, near, recovery_states
 from advnerf_core.learning.retrain import FineTuneConfig, fine_tune
-from advnerf_core.learning.sources import PolicyImages, steer_with
+from advnerf_core.learning.sources import steer_with
 from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
 from hardware.worlds.world import World
 from nodes.experiment.engine.artefact import hash_of
@@ -289,14 +287,8 @@ def _frames(
     starts = recovery_states(expert.path, 2 * drives, rng, 0.5 * near_m, 0.5 * _TURNED_RAD, begin_m)
     steer = steer_with(victim.policy, torch.tensor([plan.goal]))
 
-    def near(states: Array) -> NDArray[np.bool_]:
-        close: NDArray[np.bool_] = np.abs(expert.path.project(states[:, :2]).cte_m) <= width * _GIVE_UP_M
-        return close
-
+    keep = near(expert.path, width * _GIVE_UP_M)
     # Two side by side, so that one of them meets an attacked texture throughout.
     for first in range(0, 2 * drives, 2):
-        parts.append(plan.source.drive(steer, starts[first : first + 2], steps, near, rng))
-    seen = PolicyImages.join(parts)
-    labels = expert.steer_states(seen.states).astype(np.float32)
-    goals = np.tile(np.array(plan.goal, np.float32), (len(labels), 1))
-    return Frames(seen.images, seen.states, labels, goals, seen.textured)
+        parts.append(plan.source.drive(steer, starts[first : first + 2], steps, keep, rng))
+    return labelled(parts, expert, plan.goal)
