@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +33,14 @@ class ExperimentFile:
     Attributes:
         setting: Name of the setting; empty for a file without settings.
         document: The values.
-        variants: The values of each variant of the section ``over``.
+        of: Name of the experiment that it changes: its base's, or its own.
+        variants: The values of each variant of the section ``over``, once they are read.
     """
 
     setting: str
     document: Document
-    variants: Mapping[str, Document]
+    of: Any
+    variants: Mapping[str, Document] = field(default_factory=dict)
 
 
 def read_experiment_file(file: Path, setting: str | None, overrides: Sequence[str]) -> ExperimentFile:
@@ -52,25 +54,10 @@ def read_experiment_file(file: Path, setting: str | None, overrides: Sequence[st
     except ValueError as error:
         raise ConfigError(f"{read.document.place((OVER,))}: {error}") from None
     variants = {name: _variant(file, read, each, overrides) for name, each in changes.items()}
-    return ExperimentFile(read.setting, read.document, variants)
+    return replace(read, variants=variants)
 
 
-@dataclass(frozen=True)
-class _Read:
-    """A parsed file.
-
-    Attributes:
-        setting: Name of the setting laid over its values.
-        document: Values of the file.
-        of: Name of the experiment that it changes: its base's, or its own.
-    """
-
-    setting: str
-    document: Document
-    of: Any
-
-
-def _with_setting(file: Path, setting: str | None, above: Sequence[Path]) -> _Read:
+def _with_setting(file: Path, setting: str | None, above: Sequence[Path]) -> ExperimentFile:
     document, base_name = _on_its_base(file, above)
     settings = document.data.pop("settings", None) or {}
     if setting is None:
@@ -81,7 +68,7 @@ def _with_setting(file: Path, setting: str | None, above: Sequence[Path]) -> _Re
                 f"{file}: no setting called {setting!r}; known are {', '.join(settings) or 'none'}"
             )
         _lay_over(document, settings[setting] or {}, ("settings", setting), ())
-    return _Read(setting, document, base_name or document.data.get("name"))
+    return ExperimentFile(setting, document, base_name or document.data.get("name"))
 
 
 def _on_its_base(file: Path, above: Sequence[Path]) -> tuple[Document, Any]:
@@ -111,7 +98,9 @@ def _on_its_base(file: Path, above: Sequence[Path]) -> tuple[Document, Any]:
     return Document(under.data, document.source, under.places), name
 
 
-def _variant(file: Path, read: _Read, changes: Sequence[AxisChange], overrides: Sequence[str]) -> Document:
+def _variant(
+    file: Path, read: ExperimentFile, changes: Sequence[AxisChange], overrides: Sequence[str]
+) -> Document:
     """The values of one variant: the experiment's, or its own base's, with its changes and the overrides."""
     values = {change.key: change.value for change in changes}
     base, setting = values.pop("base", None), values.pop("setting", None)

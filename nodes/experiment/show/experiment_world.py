@@ -12,7 +12,7 @@ from typing import Any
 
 from advnerf_core.documents import Document, read_json
 from advnerf_core.driving.solids import Solids
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from hardware.worlds.world import HasSolids, NotOpenError, Traits, World, WorldDescription
 from nodes.experiment.engine.run_folder import RunFolder
 from nodes.experiment.show.kept_worlds import KeptWorld, is_users, kept_world
@@ -163,8 +163,7 @@ class ExperimentWorld(RunFolder):
             ConfigError: The description has changed.
         """
         found = as_json(world.describe())
-        text = json.dumps({"settings": self.seen_settings, "description": found}, indent=1)
-        write_atomically(self._kept_world, text + "\n")
+        write_json(self._kept_world, {"settings": self.seen_settings, "description": found})
         if as_json(self.world) != found:
             raise ConfigError(
                 f"expected the world {self.named_world.kind} to say the same about itself every time, got something else once it was open; a world "

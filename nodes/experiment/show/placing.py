@@ -6,7 +6,6 @@ along the path; it runs while the world is photographed, before there is a learn
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -75,11 +74,6 @@ def place_by_rule(experiment: Experiment, world: World) -> list[PlacedObject]:
         found.append(spot)
         standing.append(spot)
     return found
-
-
-def as_text(objects: Sequence[PlacedObject]) -> str:
-    """Placed objects as JSON."""
-    return json.dumps([each.place for each in objects], indent=1) + "\n"
 
 
 def clean_poses(experiment: Experiment, name: str) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.data.posed_images import write_posed_images
-from advnerf_core.files import write_atomically
+from advnerf_core.files import write_json
 from advnerf_core.geometry import Array, Pinhole, planar_pose
 from advnerf_core.learning.recipe import recovery_states
 from calibration.by_construction import write_twin_calibrations
@@ -20,7 +20,7 @@ from nodes.experiment.show.context import CALIBRATION, PLACED, Experiment
 from nodes.experiment.show.faces import DISPLAY, on_screen, panel_of, plain_screen, wanted_face
 from nodes.experiment.show.learned_scene import HELD_OUT
 from nodes.experiment.show.light import LIGHT, measure_light
-from nodes.experiment.show.placing import as_text, place_by_rule
+from nodes.experiment.show.placing import place_by_rule
 from nodes.experiment.show.screen import measure_display, screens_of
 from nodes.runtime.progress import Report, counted
 
@@ -40,7 +40,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             return
         if experiment.has_rules:
             report(0.0, "placing objects")
-            write_atomically(folder / PLACED, as_text(place_by_rule(experiment, scene)))
+            write_json(folder / PLACED, [each.place for each in place_by_rule(experiment, scene)])
         if experiment.config.carrier.response == "measured":
             report(0.0, "measuring the light on the panel")
             save_calibration(measure_light(experiment, scene).calibration(), folder / CALIBRATION / LIGHT)

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from advnerf_core.files import write_json
 from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.show.context import PLACED, Experiment
 from nodes.experiment.show.deployed import DressedScene
 from nodes.experiment.show.objects import placed_objects
-from nodes.experiment.show.placing import as_text, place_by_rule
+from nodes.experiment.show.placing import place_by_rule
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
@@ -35,8 +36,7 @@ def room(folder: Path, rule: str = "{}", scale: float = 0.25) -> Experiment:
 def placed(experiment: Experiment, world: Lab) -> PlacedObject:
     (spot,) = place_by_rule(experiment, world)
     file = experiment.stage_folder("capture") / PLACED
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(as_text([spot]))
+    write_json(file, [spot.place])
     return spot
 
 
