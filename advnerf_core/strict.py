@@ -170,6 +170,11 @@ def _models_in(part: Any) -> Iterator[type[BaseModel]]:
                 yield from _models_in(value)
 
 
+def is_of_settings(found: Any) -> bool:
+    """Whether something is a class of settings: a pydantic model or a dataclass."""
+    return isinstance(found, type) and (dataclasses.is_dataclass(found) or issubclass(found, BaseModel))
+
+
 def _unknown_keys(model: Any, document: Document, key: Key) -> Iterator[str]:
     """Unknown keys of models that would ignore them: dataclasses, and pydantic models without a rule for extra keys."""
     data = document.data

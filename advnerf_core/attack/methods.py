@@ -9,7 +9,6 @@ Names and needs are known without torch: the code of a built-in method is import
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -17,8 +16,6 @@ from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
-
-from pydantic import BaseModel
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.plugins import (
@@ -32,6 +29,7 @@ from advnerf_core.plugins import (
 )
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
 from advnerf_core.report.conditions import CONDITIONS
+from advnerf_core.strict import is_of_settings
 
 if TYPE_CHECKING:
     from advnerf_core.attack.problem import AttackProblem
@@ -152,12 +150,10 @@ class Method:
     title: str = ""
 
     def __post_init__(self) -> None:
-        own = self.Options
-        if own is None or (
-            isinstance(own, type) and (dataclasses.is_dataclass(own) or issubclass(own, BaseModel))
-        ):
-            return
-        raise MethodError(f"expected Options to be a dataclass or a pydantic model, got {own!r:.80}")
+        if self.Options is not None and not is_of_settings(self.Options):
+            raise MethodError(
+                f"expected Options to be a dataclass or a pydantic model, got {self.Options!r:.80}"
+            )
 
     def options(self, written: Mapping[str, Any], key: str = "options") -> Any:
         """The options in the form that `SearchSettings` carries.

@@ -31,7 +31,7 @@ from advnerf_core.plugins import (
     resolve,
 )
 from advnerf_core.policies.view import IMAGE_HEIGHT, IMAGE_WIDTH
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import StrictModel, is_of_settings
 
 if TYPE_CHECKING:
     from advnerf_core.policies.network import SteeringNetwork
@@ -227,7 +227,7 @@ def load_architecture(reference: str) -> type[SteeringNetwork]:
             f"got {found!r:.80}; see docs/policies.md"
         )
     model = found.Configuration
-    known = model is None or dataclasses.is_dataclass(model) or issubclass(model, BaseModel)
+    known = model is None or is_of_settings(model)
     if not (known and found.stateless):
         raise PluginError(
             f"{_WHAT} {reference}: expected stateless True and a Configuration that is a dataclass, a pydantic model or None, "

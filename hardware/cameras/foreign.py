@@ -7,7 +7,6 @@ beside ``kind``; the class is called with it. See docs/cameras.md.
 from __future__ import annotations
 
 import dataclasses
-import inspect
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
@@ -16,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from advnerf_core.plugins import PluginError, require_known, resolve
-from advnerf_core.strict import COMPLETE, strict_validator
+from advnerf_core.strict import COMPLETE, is_of_settings, strict_validator
 from hardware.cameras.interface import Camera
 from hardware.cameras.source import Source
 
@@ -90,9 +89,8 @@ def find_camera(name: str, folder: Path | None = None) -> Any:
         PluginError: The camera is unknown, cannot be loaded, or is not a class with a ``Config``.
     """
     found: Any = resolve(name, "camera", {}, GROUP, folder)
-    config = getattr(found, "Config", None)
-    is_model = inspect.isclass(config) and (issubclass(config, BaseModel) or dataclasses.is_dataclass(config))
-    if not inspect.isclass(found) or Camera not in found.__mro__ or not is_model:
+    is_camera = isinstance(found, type) and Camera in found.__mro__
+    if not (is_camera and is_of_settings(getattr(found, "Config", None))):
         raise PluginError(
             f"camera {name}: expected a class that derives from Camera and has an attribute Config, a pydantic model or a dataclass;"
             f" got {found!r:.80}; see {_PAGE}"

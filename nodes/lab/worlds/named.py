@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +11,7 @@ from pydantic import BaseModel, TypeAdapter
 
 from advnerf_core.documents import Document
 from advnerf_core.plugins import PluginError, absolute_reference, code_sha256, is_file_reference, resolve
-from advnerf_core.strict import validate
+from advnerf_core.strict import is_of_settings, validate
 from hardware.worlds import ENTRY_POINTS
 from hardware.worlds import WORLDS as DRIVEN
 from hardware.worlds.world import Traits, World, WorldClass, WorldDescription, members_of_a_world, traits_of
@@ -131,12 +129,7 @@ def find_world(name: str, folder: Path) -> WorldClass:
         PluginError: The world is unknown, cannot be loaded, or is not a class with a ``Config``.
     """
     found: Any = resolve(name, "world", WORLDS, ENTRY_POINTS, folder)
-    config = getattr(found, "Config", None)
-    if (
-        not inspect.isclass(found)
-        or not inspect.isclass(config)
-        or not (issubclass(config, BaseModel) or dataclasses.is_dataclass(config))
-    ):
+    if not (isinstance(found, type) and is_of_settings(getattr(found, "Config", None))):
         raise PluginError(
             f"world {name}: expected a class with an attribute Config, a pydantic model or a dataclass; got {found!r:.80}; see {_PAGE}"
         )
