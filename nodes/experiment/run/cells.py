@@ -82,7 +82,7 @@ def run_cell(
         The cell as JSON data: see `deploy.cell_data`.
 
     Raises:
-        CellError: The experiment has no such drive, victim or method.
+        NoSuchCellError: The experiment has no such drive, victim or method.
         FrozenChangedError: The scene, a victim or a place changed since the search.
     """
     require_known(experiment, cell)
@@ -106,7 +106,7 @@ def search_cell(
     """The part of `run_cell` without deployment: search and drive in the surrogate; returns the folder of the same drive without attack.
 
     Raises:
-        CellError: The experiment has no such drive, victim or method.
+        NoSuchCellError: The experiment has no such drive, victim or method.
     """
     require_known(experiment, cell)
     clean = clean_folder(experiment, cell, folder)

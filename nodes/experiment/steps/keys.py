@@ -67,7 +67,7 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
             that change only how its own car moves (`Traits.unseen`).
 
     Raises:
-        CellError: The experiment has no such drive, victim or method.
+        NoSuchCellError: The experiment has no such drive, victim or method.
     """
     require_known(experiment, cell)
     free, given_victims = dict(FREE), given_in(experiment.config)
@@ -157,7 +157,7 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
     """Raise for an impossible cell.
 
     Raises:
-        CellError: The experiment has no such drive, victim or method.
+        NoSuchCellError: The experiment has no such drive, victim or method.
     """
     retrained = [] if experiment.config.retrain is None else [RETRAINED]
     known: tuple[tuple[str, str, Sequence[str]], ...] = (

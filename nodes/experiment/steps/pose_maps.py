@@ -101,7 +101,7 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
         The pictures; none for a cell that moved no object.
 
     Raises:
-        CellError: The cell has no object of this number.
+        NoSuchCellError: The cell has no object of this number.
     """
     if not cell.searched or not isinstance(experiment.config.space, PlacesConfig):
         return []
