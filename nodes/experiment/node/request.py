@@ -26,7 +26,7 @@ def require_request(config: ExperimentConfig, source: str) -> None:
         "world {kind: scene, file: ...}, a learned scene of your own": config.own_scene,
         "one victim that exists ({policy: ...})": len(config.attacked) == 1 and not config.trained,
         "one path": len(config.cell_paths) == 1,
-        "one method of attack in over.method": len(config.conditions) == len(config.methods) == 1,
+        "one method of attack in over.method": len(config.over.method) == len(config.methods) == 1,
         "no variants": not (over.variant or over.model_extra),
     }
     for what, is_so in wanted.items():

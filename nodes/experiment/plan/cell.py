@@ -98,7 +98,7 @@ def cells_of(config: ExperimentConfig, variant: str = "") -> list[Cell]:
         cell(path, victim, method, seed)
         for victim in config.over.victim or config.attacked
         for seed in seeds_of(victim)
-        for method in config.conditions
+        for method in config.over.method
         for path in paths
     )
     return list(dict.fromkeys(found))

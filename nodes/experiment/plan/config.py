@@ -162,14 +162,9 @@ class ExperimentConfig(StrictModel):
         return self.over.seed
 
     @property
-    def conditions(self) -> tuple[str, ...]:
-        """Controls and methods of attack for a victim."""
-        return self.over.method
-
-    @property
     def methods(self) -> tuple[str, ...]:
         """Methods of attack, as references for `advnerf_core.attack.methods.load_method`."""
-        return tuple(each for each in self.conditions if each not in CONTROLS)
+        return tuple(each for each in self.over.method if each not in CONTROLS)
 
     @property
     def method_names(self) -> tuple[str, ...]:
@@ -229,7 +224,7 @@ class ExperimentConfig(StrictModel):
             empty = "no control empty in over.method (set deploy.empty_scene instead)"
             unwanted = {
                 "no retrain": "it" if retrain else "",
-                empty: "it" if EMPTY in self.conditions else "",
+                empty: "it" if EMPTY in self.over.method else "",
             }
             rules.check_face(carrier, self.space, objects, self.deploy, unwanted)
         else:

@@ -114,7 +114,7 @@ def _write_report(experiment: Experiment, console: Console, record: ProgressReco
     missing = [name for name, file in files.items() if name not in done or not file.exists()]
     notes = [f"not in the report, as a cell failed: {name} ({text})" for name, text in failed.items()]
     lacking = ""
-    if NONE not in reported.config.conditions:
+    if NONE not in reported.config.over.method:
         lacking = "no report: it compares with drives without attack, and over.method has no none; add it"
     elif missing or not reported.config.methods:
         lacking = f"no report yet: {len(found) - len(done)} of {len(found)} cells are missing"
@@ -131,8 +131,8 @@ def _write_report(experiment: Experiment, console: Console, record: ProgressReco
 def _of_methods(experiment: Experiment, names: Sequence[str]) -> Experiment:
     """The same experiment with some of its methods."""
     config = experiment.config
-    kept = tuple(each for each in config.conditions if each in CONTROLS or name_in_results(each) in names)
-    if kept == config.conditions:
+    kept = tuple(each for each in config.over.method if each in CONTROLS or name_in_results(each) in names)
+    if kept == config.over.method:
         return experiment
     over = config.over.model_copy(update={"method": kept})
     return replace(experiment, config=config.model_copy(update={"over": over}))
