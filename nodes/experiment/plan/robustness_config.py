@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 from pydantic import Field
 
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.numbers import NotNegative, Positive
-
-if TYPE_CHECKING:
-    from advnerf_core.attack.robustness import Disturbances, Smoothness
-    from advnerf_core.fields.coloured import ColouredObject
 
 
 class RobustnessConfig(StrictModel):
@@ -37,25 +30,16 @@ class RobustnessConfig(StrictModel):
     )
 
     @property
+    def spreads(self) -> dict[str, float]:
+        """Spreads of all disturbances, as `advnerf_core.attack.robustness.Disturbances` names them."""
+        return self.model_dump(exclude={"draws", "smoothness"})
+
+    @property
     def disturbed(self) -> bool:
         """Whether any disturbance is drawn."""
-        return any((self.noise, self.gain, self.brightness, self.jitter_m, self.jitter_rad))
+        return any(self.spreads.values())
 
     @property
     def repeats(self) -> int:
         """Drives of each start pose per evaluation."""
         return self.draws if self.disturbed else 1
-
-    def disturbances(self, seed: int) -> Disturbances | None:
-        """Disturbances of every evaluation of a search; None if there are none."""
-        from advnerf_core.attack.robustness import Disturbances
-
-        if not self.disturbed:
-            return None
-        return Disturbances(self.noise, self.gain, self.brightness, self.jitter_m, self.jitter_rad, seed)
-
-    def regulariser(self, objects: Sequence[ColouredObject]) -> Smoothness | None:
-        """Penalty for rough colours of the attacked objects; None without a weight."""
-        from advnerf_core.attack.robustness import Smoothness
-
-        return Smoothness(objects, self.smoothness) if self.smoothness else None

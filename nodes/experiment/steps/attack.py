@@ -19,6 +19,7 @@ from advnerf_core.attack.image_gradients import agrees_in_bfloat16
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.objectives import CTE, load_objective, objective_entry, objective_key
 from advnerf_core.attack.on_device import on_chosen_device, said_of_device
+from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space, half_precision
 from advnerf_core.documents import read_json
@@ -175,8 +176,10 @@ def attack_problem(
         fence_m=experiment.world.fence_m,
         held_cap_m=experiment.config.held_cap_m,
         off_track_m=experiment.world.off_track_m,
-        disturbances=robustness.disturbances(seed),
-        regulariser=robustness.regulariser(space.surrogate.objects),
+        disturbances=Disturbances(**robustness.spreads, seed=seed) if robustness.disturbed else None,
+        regulariser=Smoothness(space.surrogate.objects, robustness.smoothness)
+        if robustness.smoothness
+        else None,
         objective=objective,
         solids=experiment.solids if objective.needs_solids else None,
         reduced=agrees_in_bfloat16(policy.policy, experiment.view.pinhole, int(policy.policy.goal_size)),
