@@ -13,7 +13,6 @@ from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.view_loading import load_image
 from advnerf_core.data.views import PosedImages
 from advnerf_core.files import write_json
-from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.baked import BakedScene
 from advnerf_core.scene.metrics import psnr, ssim
 from advnerf_core.scene.render_field import FieldRenderer
@@ -53,12 +52,12 @@ def scene_sha256(experiment: Experiment) -> str:
     return load_hash(scene_file(experiment))
 
 
-def compare_views(experiment: Experiment, view: PolicyView, begin: float, report: Report) -> None:
+def compare_views(experiment: Experiment, begin: float, report: Report) -> None:
     """Write ``fidelity.json`` and pictures of true and learned views into the scene's folder; ``begin`` is the share of the stage before.
 
     PSNR and SSIM are taken at the camera's size and at the policy's: there the field's own render against the resized image.
     """
-    folder, renderer = experiment.stage_folder("scene"), load_field(experiment)
+    folder, view, renderer = experiment.stage_folder("scene"), experiment.view, load_field(experiment)
     listed = captured(experiment, HELD_OUT)
     views, rows = listed.load(), []
     for index, (real, pose) in enumerate(zip(views.rgb, views.T_world_from_camera, strict=True)):

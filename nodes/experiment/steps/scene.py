@@ -59,7 +59,7 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
         report(_TRAINING_SHARE, "fitting the colour map")
         metadata["colour_map"] = _colour_map(experiment, trained).to_dict()
     save_scene(scene_file(experiment), trained.scene, trained.occupied, metadata)
-    compare_views(experiment, experiment.view, _TRAINING_SHARE, report)
+    compare_views(experiment, _TRAINING_SHARE, report)
     checkpoint.unlink(missing_ok=True)
 
 
