@@ -21,7 +21,7 @@ from advnerf_core.attack.pose_maps import (
 )
 from advnerf_core.attack.pose_plots import draw_landscape, draw_robustness
 from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
+from advnerf_core.attack.search.poses import placed_sensor
 from advnerf_core.files import write_atomically
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.maps_config import LandscapeConfig, RobustnessMapConfig
@@ -50,12 +50,6 @@ class Mapped:
     digest: str
     mark: str = ""
 
-    @property
-    def sensor(self) -> PlacedSensor:
-        """Sensor of the problem."""
-        assert isinstance(self.problem.sensor, PlacedSensor), "the space of places has this sensor"
-        return self.problem.sensor
-
     def landscape(
         self, wanted: LandscapeConfig, number: int, file: Path, report: Report
     ) -> tuple[Landscape, Path]:
@@ -64,11 +58,12 @@ class Mapped:
         Raises:
             PoseMapError: The object does not exist, or the file holds another map.
         """
-        places = self.sensor.placements(self.theta)
+        sensor = placed_sensor(self.problem)
+        places = sensor.placements(self.theta)
         if number >= len(places):
             raise PoseMapError(f"expected an object of 0..{len(places) - 1}, got {number}")
         place = places[number]
-        x_m, y_m = places_over(self.sensor.space, number, wanted.points)
+        x_m, y_m = places_over(sensor.space, number, wanted.points)
         grid = (x_m, y_m, wanted.yaws_rad or (float(place[2]),))
         found = landscape(self.problem, self.theta, grid, number, file, _telling(report), self.digest)
         marked = {self.mark: (float(place[0]), float(place[1]))} if self.mark else None
@@ -110,11 +105,11 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
         raise NoSuchCellError(f"expected an object of 0 to {count - 1}, got {number}")
     attack = load_attack(folder / ATTACK)
     space, name, maps = make_space(experiment, None), experiment.objects[number].name, experiment.config.maps
-    assert isinstance(space.sensor, PlacedSensor), "the space of places has this sensor"
     problem = Prepared.of(experiment, space, cell).problem
+    sensor = placed_sensor(problem)
     places = torch.tensor([each.placement for each in attack.objects], dtype=torch.float64)
     # In the unit box even if only the plain colours are used.
-    theta = space.sensor.join(space.sensor.space.unit(places), space.restored(attack).colours)
+    theta = sensor.join(sensor.space.unit(places), space.restored(attack).colours)
     about = Mapped(problem, theta, attack.sha256, "found")
     flat, rough = folder / f"landscape_{name}.json", folder / f"robustness_{name}.json"
     return [
