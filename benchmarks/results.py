@@ -104,7 +104,7 @@ def record_row(
         machine: Where it was measured; this machine if it is not said.
         date: When, ISO; now if it is not said.
         ledger: Where the ledger is kept.
-        page: Where the index of the pages is written; the questions lie beside it in ``results/``.
+        page: Where the index of the pages is written; the questions and the published sets lie beside it in ``results/``.
     """
     if found := MACHINE_PATH.search(f"{line} {value} {target} {command} {note}"):
         raise ValueError(
@@ -128,7 +128,7 @@ def record_row(
         write_atomically(
             ledger, json.dumps(sorted(rows, key=lambda r: r["line"]), indent=1, ensure_ascii=False) + "\n"
         )
-        write_pages(read_rows(ledger), page)
+        write_pages(read_rows(ledger), page, page.parent / "results")
 
 
 def read_rows(ledger: Path = LEDGER) -> list[dict[str, Any]]:
