@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -89,8 +90,9 @@ def ledger_rows() -> list[LedgerRow]:
     return rows
 
 
+@cache
 def evidence_of(name: str) -> Evidence:
-    """A registered set."""
+    """A registered set, read once: its metrics are computed once for the rows of all that ask for it."""
     registration = read_registration(PUBLISHED / name)
     assert registration is not None, "sets are found by their registrations"
     return Evidence(registration, read_cells(PUBLISHED / name))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -52,6 +53,11 @@ class SetPoints:
     group: int
     xy: Floats
 
+    @cached_property
+    def ranks(self) -> Floats:
+        """Ranks of the searches within the set, as shares of their number."""
+        return _ranks(self.xy) / len(self.xy)
+
 
 def points_of(evidence: Evidence, group: int) -> SetPoints:
     """The registered searches of a set, each once."""
@@ -70,8 +76,7 @@ def points_of(evidence: Evidence, group: int) -> SetPoints:
 def correlation(sets: Sequence[SetPoints], within: bool, of_ranks: bool) -> float:
     """Correlation over all searches: Pearson's, or Spearman's; within sets, values or ranks are those above the set's mean."""
     if within:
-        parts = [_ranks(each.xy) / len(each.xy) if of_ranks else each.xy for each in sets]
-        both = np.concatenate([_centred(part) for part in parts])
+        both = np.concatenate([_centred(each.ranks if of_ranks else each.xy) for each in sets])
     else:
         both = np.concatenate([each.xy for each in sets])
         both = _ranks(both) if of_ranks else both

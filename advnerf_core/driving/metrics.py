@@ -112,7 +112,7 @@ def drive_metrics(
         off_track=off.size > 0,
         time_to_leaving_s=float((off[0] + 1) * limits.dt_s) if off.size else None,
         held_ticks=held,
-        ctes_m=tuple(float(value) for value in filled),
+        ctes_m=tuple(filled.tolist()),
     )
 
 

@@ -3,7 +3,7 @@ import shutil
 
 from benchmarks.answers import answers, sets_table
 from benchmarks.questions import OTHER, QUESTIONS, question_of
-from benchmarks.results import PAGE, read_rows, record_row, write_pages
+from benchmarks.results import PAGE, read_rows, record_row
 
 
 def test_a_row_replaces_its_older_self_and_a_miss_stays_with_its_reason(tmp_path):
@@ -71,12 +71,6 @@ def test_every_row_answers_a_question_and_every_benchmark_belongs_to_one():
     assert [row["line"] for row in rows if question_of(row["command"]) is OTHER] == []
     named = [name for question in QUESTIONS for name in question.commands]
     assert len(named) == len(set(named))
-
-
-def test_the_pages_are_those_of_the_ledger(tmp_path):
-    write_pages(read_rows(), tmp_path / "results.md")
-    for made in [tmp_path / "results.md", *(tmp_path / "results").iterdir()]:
-        assert made.read_text() == (PAGE.parent / made.relative_to(tmp_path)).read_text()
 
 
 def test_an_answer_counts_groups_of_searches_and_uses_the_smaller_excess(tmp_path):
