@@ -81,8 +81,8 @@ def _located(module: str) -> Iterator[tuple[Path, list[Path]]]:
 
 def _flat_files(file: Path) -> list[Path]:
     """Python files of a module without a package: of its distribution if it is installed, else of its folder."""
-    brought = _packages_by_module()
-    packages = set(brought.get(file.stem, ())) if file.parent.name.endswith("-packages") else set()
+    brought = _packages_by_module() if file.parent.name.endswith("-packages") else {}
+    packages = set(brought.get(file.stem, ()))
     if not packages:
         return sorted({file, *file.parent.glob("*.py"), *modules_beside(file)})
     tops = [top for top, owners in brought.items() if not packages.isdisjoint(owners)]

@@ -180,7 +180,7 @@ def test_the_command_says_what_is_not_met(tmp_path: Path, monkeypatch: pytest.Mo
     )
     (tmp_path / "askew.py").write_text(body)
     monkeypatch.chdir(tmp_path)
-    small = ["--set", "width=112", "--set", "height=63"]
+    small = ["--set", "width=112", "--set", "height=63", "--only", "car"]
     found = CliRunner().invoke(app, ["scene", "world", "check", "askew.py:Warehouse", *small])
     assert found.exit_code == 1
     assert "not met" in found.output
