@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from functools import cache, lru_cache
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -32,24 +32,25 @@ def before_camera(distance_m, turn_deg=0.0, tilt_deg=0.0, roll_deg=0.0, right_m=
     return make_transform(R, [right_m, down_m, distance_m])
 
 
-@cache
-def _curves(width, height, focal, cx, cy, distortion):
-    """The lens's undistortion, smooth between every eighth pixel: splines of x and y over rows and columns."""
+@lru_cache(maxsize=2)
+def _rays(width, height, focal, cx, cy, distortion, supersampling):
+    """Directions through the lens's undistortion, smooth between every eighth pixel: splines of x and y over rows and columns."""
     columns, rows = np.arange(-8.0, width + 9.0, 8.0), np.arange(-8.0, height + 9.0, 8.0)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
     matrix = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
     flat = cv2.undistortPointsIter(pixels, matrix, np.array(distortion), None, None, criteria)
     grid = flat.reshape(len(rows), len(columns), 2)
-    return [RectBivariateSpline(rows, columns, grid[..., k]) for k in range(2)]
+    down, right = ((np.arange(n * supersampling) + 0.5) / supersampling for n in (height, width))
+    x, y = (RectBivariateSpline(rows, columns, grid[..., k])(down, right) for k in range(2))
+    directions = np.stack([x, y, np.ones_like(x)], axis=-1)
+    directions.setflags(write=False)
+    return directions
 
 
 def rays(lens, supersampling):
     """Directions ``[H s, W s, 3]`` with unit depth through the lens."""
-    columns, rows = ((np.arange(n * supersampling) + 0.5) / supersampling for n in (lens.width, lens.height))
-    curves = _curves(lens.width, lens.height, lens.fx, lens.cx, lens.cy, lens.distortion)
-    x, y = (curve(rows, columns) for curve in curves)
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
+    return _rays(lens.width, lens.height, lens.fx, lens.cx, lens.cy, lens.distortion, supersampling)
 
 
 def photograph(
