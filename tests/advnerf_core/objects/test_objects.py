@@ -39,6 +39,12 @@ def ball(radius=0.5, hole=False):
     return SurfaceMesh((part_from_colours(triangles, rgb),))
 
 
+@pytest.fixture(scope="module")
+def model():
+    """A hydrant of 24 voxels along its height, as the mesh gives it."""
+    return build_from_mesh(hydrant(), "hydrant", resolution=24, steps=0)
+
+
 @pytest.mark.parametrize("hole", [False, True])
 def test_density_passes_zero_at_the_surface_and_is_opaque_inside(hole):
     grids = voxelise(ball(hole=hole), 32)
@@ -218,8 +224,7 @@ def test_a_fit_stops_in_time_and_says_that_it_is_not_finished():
     assert any("not finished" in text for text in advice(short.about))
 
 
-def test_a_rotated_object_equals_a_rotated_camera():
-    model = build_from_mesh(hydrant(), "hydrant", resolution=24, steps=0)
+def test_a_rotated_object_equals_a_rotated_camera(model):
     turn = np.eye(4)
     turn[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
     camera = look_at(np.array([2.0, 0.3, 0.5]), np.array([0, 0, 0.4]))
@@ -231,8 +236,7 @@ def test_a_rotated_object_equals_a_rotated_camera():
     np.testing.assert_allclose((turned.weights - same.weights).toarray(), 0.0, atol=1e-9)
 
 
-def test_a_scaled_object_further_away_looks_the_same():
-    model = build_from_mesh(hydrant(), "hydrant", resolution=24, steps=0)
+def test_a_scaled_object_further_away_looks_the_same(model):
     camera = look_at(np.array([2.0, 0.0, 0.0]), np.zeros(3))
     far = look_at(np.array([6.0, 0.0, 0.0]), np.zeros(3))
     near_cast = cast_object(model.placed(np.eye(4)), camera[None], viewing_lens(40), 2, np.float64)
