@@ -145,7 +145,7 @@ def test_a_search_keeps_the_best_by_value_whatever_the_total_error_is(method, tm
 def test_a_gradient_search_for_the_left_ends_further_left_than_one_for_the_total(tmp_path):
     (tmp_path / "left.py").write_text(LEFT)
     left = load_objective("left.py:Left", tmp_path)
-    settings, values = SearchSettings(12), []
+    settings, values = SearchSettings(6), []
     for objective in (CrossTrackError(), left):
         problem = toy_problem(10, dtype=torch.float32, objective=objective)
         theta = METHODS["gradient"].search(problem, settings, SearchRun(seed=2)).theta
