@@ -84,7 +84,7 @@ def test_every_kind_of_file_is_read_as_an_independent_reader_reads_it(kind, bags
 @pytest.mark.parametrize("kind", KINDS)
 def test_wherever_a_file_is_cut_its_messages_stay_and_so_does_the_file(kind, bags, tmp_path):
     draw = random.Random(kind)
-    for number in range(40):
+    for number in range(20):
         cut_once(bags[kind], draw.randrange(8, len(bags[kind])), tmp_path, number)
 
 
@@ -93,7 +93,7 @@ def test_no_flipped_bit_changes_a_number_silently(kind, bags, write, tmp_path):
     good = Numbers.of(write(bags[kind]))
     draw = random.Random(kind)
     places = [at for part in covered(bags[kind]) for at in part]
-    for number in range(40):
+    for number in range(20):
         noticed, _ = flip_once(bags[kind], draw.choice(places), draw.randrange(8), good, tmp_path, number)
         assert noticed
 
@@ -186,7 +186,7 @@ def test_damage_to_the_head_of_a_chunk_loses_nothing(kind, place, bags, write):
 def test_whatever_byte_is_damaged_repair_keeps_the_rest_or_refuses(kind, bags, write):
     """Also in bytes that no checksum covers: without --force no message is lost."""
     content, draw = bags[kind], random.Random(kind)
-    for number in range(150):
+    for number in range(75):
         at = draw.randrange(8, len(content))
         path = write(flipped(content, at, draw.randrange(8)), str(number))
         before = path.read_bytes()
