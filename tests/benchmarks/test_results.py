@@ -24,6 +24,7 @@ def test_a_row_replaces_its_older_self_and_a_miss_stays_with_its_reason(tmp_path
     assert "0.5 dB short \\| dark images" in page
     index = where["page"].read_text()
     assert "| 2 | 2 | 1 |" in index
+    assert "registered sets" not in index  # none lies beside this ledger
     missed = (tmp_path / "results" / "missed.md").read_text()
     assert "| a | 25.5 dB | >= 26 dB | [other](other.md) |" in missed
     assert "| b |" not in missed

@@ -72,7 +72,7 @@ def test_an_environment_that_was_interrupted_does_not_count(small: Small, tmp_pa
     python = tmp_path / "python"
     python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@" --without-pip\n')
     python.chmod(0o755)
-    with pytest.raises(InstallError, match="install its packages.* No module named pip"):
+    with pytest.raises(InstallError, match=r"install its packages.* No module named pip"):
         install(small, lambda text: None, python)
     assert small.interpreter.exists()
     assert small.state == "not installed"
