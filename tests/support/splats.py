@@ -160,13 +160,20 @@ def glb_bytes(
 
 def write_ply(path: Path, splats: GaussianSplats, compressed: bool = False) -> Path:
     """A file of gsply; a compressed one gets another name, which is returned."""
-    import gsply
+    # Not its plywrite, which imports the compiler of torch, to see whether it is given tensors.
+    from gsply import GSData
+    from gsply.writer import write_compressed, write_uncompressed
 
     with np.errstate(divide="ignore"):
         logits = np.log(splats.opacities / (1.0 - splats.opacities))
         parts = (splats.means_m, np.log(splats.scales_m), splats.rotations, logits, splats.harmonics[:, 0])
-    gsply.plywrite(path, *parts, splats.harmonics[:, 1:] if splats.bands > 1 else None, compressed=compressed)
-    return path.with_name(f"{path.stem}.compressed.ply") if compressed else path
+    rest = splats.harmonics[:, 1:] if splats.bands > 1 else None
+    if compressed:
+        path = path.with_name(f"{path.stem}.compressed.ply")
+        write_compressed(path, *parts, rest)
+    else:
+        write_uncompressed(path, GSData.from_arrays(*parts, rest, format="ply"))
+    return path
 
 
 def write_spz(path: Path, splats: GaussianSplats, version: int = 3) -> Path:

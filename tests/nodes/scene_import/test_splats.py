@@ -158,7 +158,7 @@ def test_an_audit_of_a_splat_alone_names_the_command(tmp_path):
 
 def test_a_splat_is_a_place_whose_searches_use_its_voxels(tmp_path):
     file = tiny_request(tmp_path / "request")
-    splats = room(60_000, size_m=(7.0, 7.0, 2.4))
+    splats = room(30_000, size_m=(7.0, 7.0, 2.4))
     splats.means_m[:, 2] += 1.2
     scene = tmp_path / "request" / "scene.safetensors"
     scene.unlink()
