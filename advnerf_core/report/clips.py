@@ -18,7 +18,6 @@ from typing import Any
 
 import av
 import cv2
-import matplotlib
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont  # comes with matplotlib
@@ -245,5 +244,7 @@ def _rgb(name: str) -> tuple[int, int, int]:
 
 @cache
 def _font(size_px: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    import matplotlib
+
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size_px)

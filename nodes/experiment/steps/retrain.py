@@ -41,7 +41,6 @@ from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import placed_objects
 from nodes.experiment.show.spaces import colour_space, random_placements
 from nodes.experiment.show.victims import load_victim
-from nodes.experiment.steps import retrain_plot
 from nodes.experiment.steps.attack import attack_problem, load_shown, surrogate_part
 from nodes.experiment.steps.frozen import freeze
 from nodes.experiment.steps.policy import plans
@@ -70,6 +69,8 @@ class Found:
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Write a folder per round, and after each ``retrain.json`` with the curve and the drives under the old attacks, and ``curve.png``."""
+    from nodes.experiment.steps import retrain_plot  # matplotlib
+
     wanted = experiment.config.retrain
     assert wanted is not None, "the stage runs only where the experiment asks for it"
     require_same_steering(experiment)
