@@ -12,17 +12,27 @@ from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import make_transform, rotation_z
-from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.config import CameraConfig, LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.run import load_experiment
-from tests.nodes.experiment.test_given_victims import MODULE
 from tests.support.lab_photographs import photograph
 
 PHOTOGRAPHS, TICKS = 24, 3
+MODULE = """
+import torch
+from advnerf_core import PolicyContract, PolicyView, adapt
+from hardware.worlds.lab.config import CameraConfig
+
+def factory():
+    torch.manual_seed(0)
+    layers = torch.nn.Conv2d(3, 8, 5, 8), torch.nn.ELU(), torch.nn.Flatten(), torch.nn.Linear(400, 1)
+    view = PolicyView(CameraConfig(width=168, height=94).pinhole, crop_top_px=10, crop_height_px=60, width=80, height=40)
+    return adapt(torch.nn.Sequential(*layers).eval(), PolicyContract(view, output_unit="deg"))
+"""
 T_IMAGES_FROM_LAB = make_transform(rotation_z(0.5), [3.0, -2.0, 1.2])
 FILE: dict[str, Any] = {
     "name": "hall", "paths": ["track"], "held_cap_m": 1.5, "horizon": TICKS, "gate": None,
@@ -33,7 +43,7 @@ FILE: dict[str, Any] = {
     "victims": {"mine": {"policy": "hall_driver:factory"}},
     "objects": [{"name": "board", "kind": "panel", "x_m": 6.43, "y_m": -2.86, "yaw_rad": 3.64, "scale": 0.3}],
     "space": {"kind": "colours"}, "deploy": {"through": "nothing"}, "capture": {"held_out": 4}, "measure": {"starts": 1},
-    "scene": {"steps": 12, "log2_entries": 10, "levels": 3, "finest": 16, "occupancy": 16},
+    "scene": {"steps": 12, "log2_entries": 10, "levels": 3, "finest": 16, "occupancy": 16, "interval_px": 64},
     "attack": {"evaluations": 2}, "over": {"method": ["none", "random", "gradient"]}, "object": {"panel_resolution": 4},
     "settings": {"tiny": {}},
 }  # fmt: skip
@@ -43,7 +53,7 @@ FILE: dict[str, Any] = {
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A user's folder: photographs that a car took on a lap of the lab, in a frame of their own, and a module with a policy."""
     found = tmp_path_factory.mktemp("hall")
-    with Lab(LabConfig()) as lab:
+    with Lab(LabConfig(camera=CameraConfig(width=168, height=94))) as lab:
         path = lab.describe().paths["track"]
         states = [path.pose_at(path.length_m * index / PHOTOGRAPHS) for index in range(PHOTOGRAPHS)]
         photograph(lab, states, found / "my_photos", T_IMAGES_FROM_LAB)
