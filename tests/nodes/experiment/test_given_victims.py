@@ -37,21 +37,23 @@ TICKS = 3
 MODULE = """
 import torch
 from advnerf_core import PolicyContract, PolicyView, adapt
-from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.config import CameraConfig
 
 def factory():
     torch.manual_seed(0)
-    layers = torch.nn.Conv2d(3, 8, 5, 8), torch.nn.ELU(), torch.nn.Flatten(), torch.nn.Linear(1600, 1)
-    view = PolicyView(LabConfig().camera.pinhole, crop_top_px=20, crop_height_px=120, width=160, height=80)
+    layers = torch.nn.Conv2d(3, 8, 5, 8), torch.nn.ELU(), torch.nn.Flatten(), torch.nn.Linear(400, 1)
+    view = PolicyView(CameraConfig(width=168, height=94).pinhole, crop_top_px=10, crop_height_px=60, width=80, height=40)
     normal = {"mean": (104.0, 117.0, 124.0), "std": (58.0, 57.0, 57.0), "value_max": 255.0}
     return adapt(torch.nn.Sequential(*layers).eval(), PolicyContract(view, colour_space="BGR", **normal, output_unit="deg", positive="right"))
 """
+CAMERA = {"width": 168, "height": 94}
+LAB = {"camera": CAMERA, "phone": {"width": 160, "height": 120}}
 FILE: dict[str, Any] = {
-    "name": "mine", "world": {"kind": "lab"}, "paths": ["track"], "held_cap_m": 1.5, "horizon": TICKS, "gate": None,
+    "name": "mine", "world": {"kind": "lab", **LAB}, "paths": ["track"], "held_cap_m": 1.5, "horizon": TICKS, "gate": None,
     "victims": {"mine": {"policy": "my.onnx"}, "module": {"policy": "my_driver:factory"}},
     "carrier": {"kind": "overlay", "resolution": 8}, "space": {"kind": "colours", "cells": 8}, "measure": {"starts": 1},
     "capture": {"photos": 9, "held_out": 3, "colour_pairs": 3}, "attack": {"evaluations": 2}, "over": {"method": ["none", "random"]},
-    "scene": {"steps": 20, "log2_entries": 10, "finest": 32, "occupancy": 32}, "settings": {"tiny": {}},
+    "scene": {"steps": 20, "log2_entries": 10, "finest": 32, "occupancy": 32, "interval_px": 32}, "settings": {"tiny": {}},
 }  # fmt: skip
 ONLY_THE_MODULE = ("victims={module: {policy: 'my_driver:factory'}}", "over.method=[none,random,gradient]")
 
@@ -108,7 +110,7 @@ def test_the_file_drives_as_the_runtime_of_onnx_says(folder: Path) -> None:
     """A second implementation of camera, declaration and drive: OpenCV's own channel order, and ONNX Runtime asked directly."""
     experiment, session = loaded(folder), onnxruntime.InferenceSession(folder / "my.onnx")
     kept = read_json(driven_folder(experiment, Cell("track", "mine", "none", 0)) / DRIVES)
-    with Lab(LabConfig()) as world:
+    with Lab(LabConfig.model_validate(LAB)) as world:
         world.reset(*map(float, experiment.measured_starts("track")[0]))
         for tick in range(TICKS):
             steering = steering_rad(session, experiment.view.image(world.observe(depth=False)[0]))
@@ -140,7 +142,7 @@ def test_a_policy_of_waypoints_and_two_images_is_attacked_and_drives_as_the_runt
     experiment, session = loaded(folder, change), onnxruntime.InferenceSession(folder / "plans.onnx")
     assert "total_cte_m" in read_json(experiment.cell_result(Cell("track", "plans", "random", 0)))["deployed"]
     kept = read_json(driven_folder(experiment, Cell("track", "plans", "none", 0)) / DRIVES)
-    with Lab(LabConfig()) as world:
+    with Lab(LabConfig.model_validate(LAB)) as world:
         world.reset(*map(float, experiment.measured_starts("track")[0]))
         before = None
         for tick in range(TICKS):
@@ -213,13 +215,12 @@ def test_a_registration_fixes_them_by_hash_before_anything_is_run(folder: Path, 
 def test_their_camera_is_compared_with_a_world_that_must_be_open_to_be_described(
     folder: Path, tmp_path: Path
 ) -> None:
-    change = f"world={{kind: '{shut_world.NAME}'}}"
+    change = f"world={{kind: '{shut_world.NAME}', camera: {CAMERA}}}"
     experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", (change,), tmp_path / "run")
     assert not experiment.is_described
     run_experiment(experiment, until="capture")
     assert (
-        load_experiment(folder / "mine.experiment.yaml", "tiny", (change,), tmp_path / "run").view.width
-        == 160
+        load_experiment(folder / "mine.experiment.yaml", "tiny", (change,), tmp_path / "run").view.width == 80
     )
 
 
