@@ -32,7 +32,7 @@ LENS = lens(960, 720, 750.0)
 LIGHT = np.array([0.85, 0.75, 0.6])
 
 
-def on_paper(sheet, dpi=150.0):
+def on_paper(sheet, dpi):
     """The linear reflectance of a printed sheet, and its size [m]."""
     width_mm, height_mm = sheet.sheet_mm
     size = (round(width_mm * dpi / 25.4), round(height_mm * dpi / 25.4))
@@ -58,10 +58,10 @@ def test_a_printer_whose_inks_are_known(call, tmp_path):
     assert call("car", "calibrate", "printer-chart", "-o", tmp_path / "chart.pdf")[0] == 0
     assert (tmp_path / "chart.pdf").read_bytes().count(b"/MediaBox [0 0 841.889764 595.275591]") == 1
     save_calibration(LENS, tmp_path / "lens.yaml")
-    T = before_camera(0.36, 12, 8, 2)
+    T, chart = before_camera(0.36, 12, 8, 2), on_paper(make_chart("a4"), 100.0)
     write_image(
         tmp_path / "photo.png",
-        photograph([(on_paper(make_chart("a4")), T)], LENS, light=LIGHT, slope=0.15, black=0.0),
+        photograph([(chart, T)], LENS, light=LIGHT, slope=0.15, black=0.0),
     )
     command = (
         "car",
@@ -89,7 +89,7 @@ def test_a_printer_whose_inks_are_known(call, tmp_path):
     assert model.inverse([[0.0, 1.0, 0.0]])[1] == 1.0  # no ink is that green
     write_image(
         tmp_path / "photo.png",
-        photograph([(on_paper(make_chart("a4")), T)], LENS, light=3.0 * LIGHT, black=0.0),
+        photograph([(chart, T)], LENS, light=3.0 * LIGHT, black=0.0),
     )
     code, said = call(*command, "-o", tmp_path / "no.yaml")
     assert code == 2
@@ -100,9 +100,9 @@ def test_a_printer_whose_inks_are_known(call, tmp_path):
 def test_search_print_hang_photograph_measure_and_drive_in_the_simulated_lab(call, tmp_path):
     request = tiny_request(tmp_path, evaluations=2)
     (file,) = run_attack(loaded(request), tmp_path / "run", ProgressDisplay())
-    assert call("attack", "print", file, "-o", tmp_path / "p.png", "--dpi", 60)[0] == 0
+    assert call("attack", "print", file, "-o", tmp_path / "p.png", "--dpi", 25)[0] == 0
     sheet = poster_of(load_attack(file)).with_markers()
-    reflectance, (width_m, height_m) = on_paper(sheet, 60.0)
+    reflectance, (width_m, height_m) = on_paper(sheet, 25.0)
     scale = 0.97
     T = make_transform(rotation_z(3.0), [1.3, -1.6, 0.7])
     camera = np.array([0.05, -1.35, 0.75])
