@@ -17,6 +17,7 @@ from calibration.print_chart import make_chart
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
+from nodes.experiment.node.printed import write_record
 from nodes.experiment.node.search import run_attack
 from nodes.runtime.messages import encode, image_message, pose_message
 from nodes.runtime.progress import ProgressDisplay
@@ -62,11 +63,13 @@ def poster(folder):
 
 def test_a_photograph_gives_pose_and_colours_and_with_one_length_the_size(call, folder):
     assert (
-        call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 100)[0] == 0
+        call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 50)[0] == 0
     )
     T, scale = before_camera(0.9, 25, 8, 3, 0.03), 1.03  # the shop printed 3 % too large
     nominal = make_transform(T[:3, :3], T[:3, 3] / scale)
-    picture = photograph([(scaled(poster(folder), scale, scale), T)], LENS, light=(0.9, 0.75, 0.6), slope=0.4)
+    picture = photograph(
+        [(scaled(poster(folder), scale, scale, 75.0), T)], LENS, light=(0.9, 0.75, 0.6), slope=0.4
+    )
     write_image(folder / "photo.jpg", picture)
     command = (
         "attack",
@@ -103,7 +106,8 @@ def test_a_chart_beside_it_is_a_card(call, folder):
     assert call("car", "calibrate", "printer-chart", "-o", folder / "chart.png", "--dpi", 100)[0] == 0
     T = before_camera(0.75, -15, 5, 0, -0.13)
     beside = T @ make_transform(np.eye(3), [0.0, 0.42, 0.0])
-    picture = photograph([(make_chart("a4"), beside), (scaled(poster(folder), 0.98, 0.98), T)], LENS)
+    sheets = [(make_chart("a4"), beside), (scaled(poster(folder), 0.98, 0.98, 75.0), T)]
+    picture = photograph(sheets, LENS, dpi=100.0)
     write_image(folder / "photo.png", picture)
     command = (
         "attack",
@@ -120,6 +124,22 @@ def test_a_chart_beside_it_is_a_card(call, folder):
     assert (found["size_m"], found["size_from"]) == (pytest.approx((0.392, 0.392), rel=0.005), "a card")
     assert np.array(found["T_camera_from_face"]) == pytest.approx(T, abs=0.006)
     assert call(*command, "--card", folder / "chart.print.json", "--width", 0.4)[0] == 2
+
+
+@pytest.fixture
+def measuring(folder):
+    """The words that measure a photograph of everything but the print."""
+    write_record(poster(folder), folder / "a.attack.safetensors", folder / "p.png", 50.0)
+    noise = np.random.default_rng(0).integers(0, 256, (720, 960, 3)).astype(np.uint8)
+    write_image(folder / "photo.png", noise)
+    files = folder / "photo.png", "--print", folder / "p.print.json", "--camera", folder / "lens.yaml"
+    return "attack", "measure", *files
+
+
+def test_a_photograph_without_the_print_is_refused(call, measuring):
+    code, said = call(*measuring)
+    assert code == 2
+    assert "found none of its 12 markers" in said
 
 
 def changed(file, **values):
@@ -151,24 +171,9 @@ def changed(file, **values):
         (lambda folder: (folder / "a.attack.safetensors").unlink(), "expected an attack file"),
     ],
 )
-def test_damaged_and_irrelevant_files_are_refused_in_one_line(call, folder, change, message):
-    call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 50)
-    noise = np.random.default_rng(0).integers(0, 256, (720, 960, 3)).astype(np.uint8)
-    write_image(folder / "photo.png", noise)
-    command = (
-        "attack",
-        "measure",
-        folder / "photo.png",
-        "--print",
-        folder / "p.print.json",
-        "--camera",
-        folder / "lens.yaml",
-    )
-    code, said = call(*command)
-    assert code == 2
-    assert "found none of its 12 markers" in said
+def test_damaged_and_irrelevant_files_are_refused_in_one_line(call, folder, measuring, change, message):
     change(folder)
-    code, said = call(*command)
+    code, said = call(*measuring)
     assert code == 2
     assert message in said
     assert said.count("error:") == 1
