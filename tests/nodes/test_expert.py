@@ -86,12 +86,12 @@ def test_the_integrals_take_out_wheels_and_speed_that_are_off():
 
 
 def test_disturbances_are_declared_repeatable_and_not_in_what_it_wants():
-    def drive():
+    def drive(duration_s):
         car = Car((-0.9, -2.0, 0.0), disturb=Disturbance(steering_rad=0.2, seed=3))
-        car.run(25.0)
+        car.run(duration_s)
         return car.states
 
-    states = drive()
+    states = drive(25.0)
     off = np.array([s.disturbance_rad for s in states])
     assert 0.05 < np.mean(off != 0.0) < 0.5
     assert (off > 0.0).any()
@@ -99,7 +99,9 @@ def test_disturbances_are_declared_repeatable_and_not_in_what_it_wants():
     assert np.abs(off).max() <= 0.2 + 1e-9
     cte = np.array([s.cte_m for s in states])
     assert 0.05 < np.abs(cte).max() < 0.4
-    assert [s.disturbance_rad for s in drive()] == off.tolist()
+    again = [s.disturbance_rad for s in drive(5.0)]
+    assert any(again)
+    assert again == off[: len(again)].tolist()
 
 
 def test_disarmed_it_disturbs_and_integrates_nothing():
