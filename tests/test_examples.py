@@ -81,12 +81,17 @@ def imported(file):
     return names
 
 
+@pytest.fixture(scope="module")
+def packages():
+    """The installed packages by the modules that they bring."""
+    return packages_distributions()
+
+
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.stem)
-def test_an_example_imports_only_what_is_installed(file):
+def test_an_example_imports_only_what_is_installed(file, packages):
     ours = {"advnerf_core", "calibration", "hardware", "nodes"}
     ros2 = {"rclpy", "geometry_msgs", "sensor_msgs"} if file.stem == "ros2_policy" else set()
     declared = {re.match(r"[\w-]+", line)[0].lower() for line in requires("advnerf") if "dev" not in line}
-    packages = packages_distributions()
     for name in imported(file) - ours - ros2 - sys.stdlib_module_names:
         assert {package.lower() for package in packages[name]} & declared, name
 
