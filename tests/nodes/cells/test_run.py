@@ -42,14 +42,14 @@ def test_cells_run_once_and_only_what_changed_again(here):
     assert "nothing to do" in said[-1]
 
     here.write(seed=[0, 1, 2], method=["none", "gradient"])
-    ended, _ = run(here)
+    ended, _ = run(here, here=True)
     assert [end.name for end in ended] == ["straight_hardened_gradient_2"]
     assert all(here.cells.joinpath(name).stat().st_mtime_ns == stamp for name, stamp in before.items())
 
     began = time.monotonic()
     here.describe(none_m=5.0)
     assert set(states(here).values()) == {"changed"}
-    ended, _ = run(here)
+    ended, _ = run(here, here=True)
     assert len(ended) == 4
     result = json.loads((here.cells / "straight_hardened_gradient_1.json").read_text())
     assert result["surrogate"]["total_cte_m"] == [18.0]
@@ -71,7 +71,7 @@ def test_a_cell_that_was_not_driven_live_ends_well_and_is_tried_again_only_on_re
     assert ended == []
     assert sum("not tried again without --retry" in text for text in said) == 2
     (here.folder / "late").unlink()
-    ended, _ = run(here, retry=True)
+    ended, _ = run(here, retry=True, here=True)
     assert sorted(end.name for end in ended) == [f"straight_hardened_gradient_{seed}" for seed in (0, 1)]
     assert set(states(here).values()) == {"done"}
 
@@ -90,7 +90,7 @@ def test_a_killed_worker_loses_its_cell_and_no_other(here):
     assert found.pop("straight_hardened_gradient_0") == "begun"
     assert set(found.values()) == {"done"}
     (here.cells / "straight_hardened_gradient_0" / "work").write_text("half of it")
-    ended, _ = run(here)
+    ended, _ = run(here, here=True)
     assert [(end.name, end.how) for end in ended] == [("straight_hardened_gradient_0", "done")]
     assert (here.cells / "straight_hardened_gradient_0" / "work").exists()  # it went on in its own folder
 
@@ -238,7 +238,7 @@ def test_a_worker_that_is_asked_to_end_has_not_failed(here):
 
 def test_a_cell_that_fails_anew_is_failed_whatever_it_found_before(here):
     here.write(seed=[0], method=["cem"])
-    assert [end.how for end in run(here)[0]] == ["done"]
+    assert [end.how for end in run(here, here=True)[0]] == ["done"]
     here.describe(none_m=5.0)
     (here.folder / "fail").touch()
     assert [end.how for end in run(here)[0]] == ["failed"]
