@@ -58,7 +58,7 @@ def resolve(
         return built_in[name]()
     if is_file_reference(name):
         return load_from_file(name, what, folder)
-    (entry,) = _entries(name, group)
+    (entry,) = entries_named(name, group)
     return _load_entry_point(entry, what)
 
 
@@ -80,7 +80,7 @@ def require_known(
     if is_file_reference(name):
         _file_of(name, what, folder)
         return
-    owners = [*(["advnerf"] if name in built_in else []), *map(origin_of, _entries(name, group))]
+    owners = [*(["advnerf"] if name in built_in else []), *map(origin_of, entries_named(name, group))]
     if len(owners) > 1:
         raise PluginError(
             f"{what} {name}: expected one {what} of this name, got {len(owners)}: of {' and of '.join(owners)}; remove one of these "
@@ -106,7 +106,7 @@ def code_sha256(name: str, built_in: Container[str], group: str, folder: Path | 
         return ""
     if is_file_reference(name):
         return file_sha256(Path(absolute_reference(name, folder or Path.cwd()).rpartition(":")[0]))
-    entry = next(iter(_entries(name, group)), None)
+    entry = next(iter(entries_named(name, group)), None)
     return "" if entry is None else entry_point_sha256(entry)
 
 
@@ -116,7 +116,8 @@ def known_names(built_in: Iterable[str], group: str) -> tuple[str, ...]:
     return (*own, *sorted({each.name for each in _installed(group)} - set(own)))
 
 
-def _entries(name: str, group: str) -> list[EntryPoint]:
+def entries_named(name: str, group: str) -> list[EntryPoint]:
+    """Entry points of a group with a name; nothing is loaded."""
     return [each for each in _installed(group) if each.name == name]
 
 

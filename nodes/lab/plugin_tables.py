@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from advnerf_core.code_files import entry_point_sha256, file_sha256, module_sha256
-from advnerf_core.plugins import absolute_reference, is_file_reference, origin_of
+from advnerf_core.plugins import absolute_reference, entries_named, is_file_reference, origin_of
 from advnerf_core.policies.load import is_factory
 
 BUILT_IN = "built in"
@@ -181,6 +181,6 @@ def _line_of_code(key: str, text: str, folder: Path) -> str:
         return f"{text} (sha256 {module_sha256(module)[:_DIGITS]})"
     for table in TABLES.values():
         if key in table.keys:
-            for entry in entry_points(group=table.group, name=text):
+            for entry in entries_named(text, table.group):
                 return f"{text} of {origin_of(entry)} (sha256 {entry_point_sha256(entry)[:_DIGITS]})"
     return ""
