@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from advnerf_core.files import write_json
+from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.show.context import PLACED, Experiment
@@ -28,6 +29,7 @@ def room(folder: Path, rule: str = "{}", scale: float = 0.25) -> Experiment:
         "carrier={kind: composed}",
         "deploy.through=world",
         "object.panel_resolution=8",
+        "horizon=45",
         f"objects=[{{name: board, kind: panel, scale: {scale}, stands: {rule}}}]",
     ]
     return load_experiment(ROOM, "demo", changes, folder)
@@ -42,7 +44,7 @@ def placed(experiment: Experiment, world: Lab) -> PlacedObject:
 
 @pytest.fixture(scope="module")
 def lab():
-    with Lab() as world:
+    with Lab(LabConfig(supersampling=1)) as world:
         # Every search for a spot looks from the same poses.
         world.observe_at = lru_cache(maxsize=None)(world.observe_at)
         yield world
