@@ -11,6 +11,7 @@ from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.space import ColourSpace, NamedObject
 from advnerf_core.geometry import planar_pose
 from advnerf_core.scene.surrogate import Surrogate
+from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.world import shading
 from nodes.experiment.show.deployed import DressedScene
@@ -28,6 +29,7 @@ CHANGES = [
     "space.cells=0",
     "object.panel_resolution=8",
     "policy.naive_steps=0",
+    "horizon=40",
     "carrier={kind: composed, training: native, response: measured}",
 ]
 
@@ -38,7 +40,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory):
     experiment = load_experiment(
         LAUNCH / "room.experiment.yaml", "demo", [*CHANGES, f"objects=[{BOARD}]"], folder
     )
-    with Lab() as world:
+    with Lab(LabConfig(supersampling=1)) as world:
         yield experiment, world, measure_light(experiment, world)
 
 
@@ -95,7 +97,10 @@ def test_light_needs_a_panel_and_a_world_that_takes_it(tmp_path: Path) -> None:
         ConfigError, match=r"own scene \(add_panel\) with carrier.training native, got junction"
     ):
         load("junction", *CHANGES[2:], board)
-    with Lab() as world, pytest.raises(ConfigError, match="hidden, turned away or too small"):
+    with (
+        Lab(LabConfig(supersampling=1)) as world,
+        pytest.raises(ConfigError, match="hidden, turned away or too small"),
+    ):
         measure_light(load("room", *CHANGES, f"objects=[{BOARD.replace('2.8, scale', '0.3, scale')}]"), world)
     plain = load("room", *CHANGES[:-1], "carrier={kind: composed, training: native}", f"objects=[{BOARD}]")
     measured = load("room", *CHANGES, f"objects=[{BOARD}]")
