@@ -18,6 +18,7 @@ from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from tests.support.remote.flat_world import FlatConfig, FlatWorld
 
+CAMERA = {"width": 168, "height": 94}
 WORLD = Path(__file__).parents[2] / "support" / "remote" / "flat_world.py"
 
 
@@ -26,7 +27,8 @@ def experiment_in(folder: Path, *changes: str) -> Experiment:
     file = folder / "flat.experiment.yaml"
     data = {
         "name": "flat",
-        "world": {"kind": f"{WORLD}:FlatWorld", "seed": 1},
+        "world": {"kind": f"{WORLD}:FlatWorld", "seed": 1, **CAMERA},
+        "view": {"crop_top_px": 12, "crop_height_px": 55},
         "paths": ["round"],
         "horizon": 26,
         "objects": [
@@ -69,7 +71,7 @@ def test_each_place_is_seen_bare_and_with_the_panel_in_random_colours(
     looks = [plan.source.look(_along(plan.expert, 8), rng) for plan in plans]
     for seed, bare in ((2, looks[0]), (3, looks[2])):
         assert not bare.textured.any()
-        with FlatWorld(FlatConfig(seed=seed)) as there:
+        with FlatWorld(FlatConfig(seed=seed, **CAMERA)) as there:
             for image, state in zip(bare.images, bare.states, strict=True):
                 seen = there.observe_at(*map(float, state), depth=False)[0]
                 assert np.array_equal(image, experiment.view.image(seen))
