@@ -24,7 +24,7 @@ Broken = Method({search})
 
 def run(folder, method):
     """Cells and report with a method of a user's file beside random textures; what was printed, and how the cells ended."""
-    changes = [*TINY, f"over.method=[none,random, '{method}:Broken']"]
+    changes = [*TINY, "attack.horizon=2", f"over.method=[none,random, '{method}:Broken']"]
     experiment = load_experiment(ROOT / "launch" / "room.experiment.yaml", "demo", changes, folder)
     console = Console(width=400, record=True, quiet=False)
     ended = whole.run_experiment(experiment, console=console)

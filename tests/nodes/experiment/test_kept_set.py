@@ -24,7 +24,14 @@ from nodes.experiment.steps import run
 from tests.support.published import write_set
 from tests.support.stage_versions import tiny_experiment
 
-CHANGES = ("over.method=[none,gradient]", "over.seed=[0,1]", "measure.starts=2", "deploy.starts=1")
+CHANGES = (
+    "over.method=[none,gradient]",
+    "over.seed=[0,1]",
+    "measure.starts=2",
+    "deploy.starts=1",
+    "horizon=4",
+    "attack.horizon=3",
+)
 
 
 def experiment_in(folder, *more):

@@ -55,7 +55,7 @@ def with_victims(folder, victims=RECIPES, *changes):
 
 def test_every_victim_is_trained_by_its_recipe_attacked_and_in_the_table(tiny_room, tmp_path):
     shutil.copytree(tiny_room[0], tmp_path / "run")
-    experiment = with_victims(tmp_path / "run")
+    experiment = with_victims(tmp_path / "run", RECIPES, "attack.horizon=2", "attack.evaluations=1")
     with recording() as reads:
         make_ready(experiment, watcher=reads)
     keys = {stage.name: stage.settings.resolved for stage in stages_of(experiment)}
