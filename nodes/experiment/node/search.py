@@ -202,6 +202,7 @@ def _run_together(
 
 def _keep(prepared: Prepared, result: SearchResult) -> None:
     """Write what a finished search found: the curve, of places a picture, and last the attack file, which says that the seed is done."""
+    prepared.require_seen(result)
     file = attack_file(prepared.experiment.folder, prepared.seed)
     attack = make_attack_file(prepared, result)
     curve: dict[str, Any] = {

@@ -97,6 +97,29 @@ class Prepared:
         plain = self.space.plain
         return clean_drive(past(self.problem, self.space, plain), plain.colours)
 
+    def require_seen(self, found: SearchResult) -> None:
+        """Raise for a search whose objects are never in view: its result would look like a robust policy.
+
+        Equal drives alone may be of a policy that ignores the objects, so that pictures are compared.
+
+        Raises:
+            ConfigError: No picture of the drive depends on the objects.
+        """
+        problem = self.problem.undisturbed()
+        differ = len({each.total_cte_m for each in found.history}) > 1
+        if isinstance(self.experiment.config.space, MeshShapeConfig) or (differ and problem is self.problem):
+            return
+        rollout, _ = evaluate(problem, found.theta)
+        for tick, states in enumerate(rollout.states[:-1]):
+            one, other = (problem.sense((tick,), states, theta) for theta in (found.theta, 1.0 - found.theta))
+            if not torch.equal(one.images, other.images):
+                return
+        names = ", ".join(each.name for each in self.experiment.objects)
+        raise ConfigError(
+            f"expected {names} in view of the searched drives, got {len(rollout.states) - 1} ticks whose pictures do not depend on it; "
+            "move it (x_m, y_m, z_m, yaw_rad, scale), or the starts"
+        )
+
 
 def surrogate_part(
     experiment: Experiment, space: Space, cell: Cell, folder: Path, report: Callable[..., None]
@@ -116,6 +139,7 @@ def surrogate_part(
     attack_id, curve, seconds, values = None, [], 0.0, {}
     if cell.searched:
         result = _search(prepared, folder, report)
+        prepared.require_seen(result)
         seconds = sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
         if experiment.config.attack.objective != CTE:

@@ -14,7 +14,7 @@ from advnerf_core.attack.search.black_box import BudgetError
 from advnerf_core.display import DisplayModel
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.onnx_policy import export_onnx
-from advnerf_core.policies.policy_file import load_policy
+from advnerf_core.policies.policy_file import load_policy, save_policy
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import save_calibration
 from nodes.cli import main as cli
@@ -196,11 +196,32 @@ def test_the_check_confirms_the_gradient_and_says_so(tmp_path):
     np.testing.assert_allclose(found.ticks.visible, 1.0)
 
 
+AWAY = "objects=[{name: a, kind: panel, x_m: -3.5, y_m: 3.0, face: {size_m: 0.8, resolution: 4}}]"
+
+
 def test_an_object_out_of_sight_has_no_gradient_and_the_check_says_so(tmp_path):
-    away = ["objects=[{name: a, kind: panel, x_m: -3.5, y_m: 3.0, face: {size_m: 0.8, resolution: 4}}]"]
-    found = check(loaded(tiny_request(tmp_path), away), 2, False, lambda fraction, text="": None)
+    found = check(loaded(tiny_request(tmp_path), [AWAY]), 2, False, lambda fraction, text="": None)
     assert not found.sound
     assert found.verdict[0].startswith("NO GRADIENT")
+
+
+@pytest.mark.parametrize("changes", [["over.method=[random]"], ["attack.robustness.noise=0.01"]])
+def test_a_search_of_an_object_out_of_sight_is_no_result(tmp_path, changes):
+    request = loaded(tiny_request(tmp_path, evaluations=2), [AWAY, *changes])
+    with pytest.raises(ConfigError, match="expected a in view of the searched drives, got .* ticks whose"):
+        run_attack(request, tmp_path / "run", ProgressDisplay())
+    assert not attack_file(tmp_path / "run", 0).exists()
+
+
+def test_a_policy_that_ignores_what_it_sees_is_a_result(tmp_path):
+    file = tiny_request(tmp_path, evaluations=2)
+    policy = load_policy(tmp_path / "policy.safetensors")
+    with torch.no_grad():
+        for weights in policy.policy.parameters():
+            weights.zero_()
+    save_policy(tmp_path / "policy.safetensors", policy.policy, policy.view, {})
+    (found,) = run_attack(loaded(file, ["over.method=[random]"]), tmp_path / "run", ProgressDisplay())
+    assert len(set(json.loads(found.with_name("seed_0.json").read_text())["predicted_total_cte_m"])) == 1
 
 
 def command(monkeypatch, *words):
