@@ -66,7 +66,7 @@ def write_audit_page(folder: Path, film) -> Path:
         across = off_m * along / 5.0
         states = np.stack([[along, across + 0.02 * start, 0.0 * along] for start in range(4)]).swapaxes(1, 2)
         largest = np.full(4, off_m)
-        driven[name] = ArmDrives(states, largest, 0.5 * largest, states[:, 1:, 1], np.full(4, 19))
+        driven[name] = ArmDrives(states, largest, 0.5 * largest, np.full(4, 19))
     path = DrivenPath.from_segments((0.0, 0.0, 0.0), [Line(6.0)], closed=False)
     return write_page(folder, audit_result(), {"world": driven}, path, film, [])
 
