@@ -13,7 +13,7 @@ from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.conditions import CONTROLS, order_of, style_of
 from advnerf_core.report.evidence.registration import FILE
 from advnerf_core.report.evidence.words import DOMAIN_TITLES
-from advnerf_core.report.result_table import Wanted, make_table
+from advnerf_core.report.result_table import make_table
 from benchmarks.questions import LOST
 from benchmarks.results import REPOSITORY
 
@@ -57,7 +57,7 @@ def _rows(cells: list[CellResult]) -> Iterator[str]:
         if cell.method not in CONTROLS and cell.ticks:
             seeds.setdefault(cell.key, []).append(cell.seed)
     keys = sorted(seeds, key=lambda key: (key[:3], order_of(key[3])))
-    for row in make_table([Wanted(*key, tuple(seeds[key])) for key in keys], cells).rows:
+    for row in make_table({key: seeds[key] for key in keys}, cells).rows:
         if row.excess is not None:
             place = " ".join(filter(None, row.key[:2]))
             yield (

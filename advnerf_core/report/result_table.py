@@ -6,41 +6,19 @@ named as missing.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from advnerf_core.report.cells import CellResult
-from advnerf_core.report.evidence.rows import CellDrives, Key, Row, make_row
+from advnerf_core.report.evidence.rows import CellDrives, Key, Row, RowOf, make_row
 from advnerf_core.report.reference import DOMAINS, Domain
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """A row that a table should have, with its seeds; the placement is empty for the scenario's own."""
-
-    scenario: str
-    placement: str
-    victim: str
-    method: str
-    seeds: tuple[int, ...]
-    deployed: bool = True
-
-    @property
-    def domains(self) -> tuple[Domain, ...]:
-        """Domains of its drives."""
-        return tuple(each for each in DOMAINS if self.deployed or each == "surrogate")
-
-    @property
-    def key(self) -> Key:
-        """The row's key without seeds."""
-        return self.scenario, self.placement, self.victim, self.method
-
-
-@dataclass(frozen=True)
-class TableRow:
+class TableRow(RowOf):
     """One line of the table: all seeds of a scenario, victim and method in one domain. None for missing values.
 
     Attributes:
@@ -52,11 +30,6 @@ class TableRow:
         excess: Excess per tick over both controls; None if the ticks are unknown.
     """
 
-    scenario: str
-    placement: str
-    victim: str
-    method: str
-    domain: Domain
     seeds: tuple[int, ...]
     missing: tuple[int, ...]
     drives: int = 0
@@ -66,11 +39,6 @@ class TableRow:
     plain_total_m: float | None = None
     ticks: int = 0
     excess: Row | None = None
-
-    @property
-    def key(self) -> Key:
-        """Scenario, placement, victim and method."""
-        return self.scenario, self.placement, self.victim, self.method
 
     @property
     def ratio(self) -> float | None:
@@ -112,19 +80,23 @@ class ResultTable:
         return [cell for cell in self.cells.values() if cell.key == row.key]
 
 
-def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str = "") -> ResultTable:
-    """Summarise cells: missing rows are named, and cells that were not requested are left out."""
-    seeds = {want.key: want.seeds for want in wanted}
-    drives = CellDrives(cell for cell in cells if cell.seed in seeds.get(cell.key, ()))
-    rows = tuple(_row(want, drives, domain) for want in wanted for domain in want.domains)
+def make_table(
+    wanted: Mapping[Key, Sequence[int]],
+    cells: Iterable[CellResult],
+    name: str = "",
+    domains: Sequence[Domain] = DOMAINS,
+) -> ResultTable:
+    """Summarise cells as one row per domain of each wanted key: missing seeds are named, and cells that were not requested are left out."""
+    drives = CellDrives(cell for cell in cells if cell.seed in wanted.get(cell.key, ()))
+    rows = tuple(_row(key, seeds, drives, domain) for key, seeds in wanted.items() for domain in domains)
     return ResultTable(rows, drives.cells, name)
 
 
-def _row(want: Wanted, drives: CellDrives, domain: Domain) -> TableRow:
-    found = [(cell, driven) for cell in drives.searches(want.key) if (driven := cell.drives(domain))]
+def _row(key: Key, wanted: Sequence[int], drives: CellDrives, domain: Domain) -> TableRow:
+    found = [(cell, driven) for cell in drives.searches(key) if (driven := cell.drives(domain))]
     seeds = tuple(cell.seed for cell, _ in found)
-    missing = tuple(seed for seed in want.seeds if seed not in seeds)
-    row = TableRow(*want.key, domain, seeds, missing)
+    missing = tuple(seed for seed in wanted if seed not in seeds)
+    row = TableRow(*key, domain, seeds, missing)
     if not found:
         return row
     totals = [total for _, driven in found for total in driven.total_cte_m]
@@ -137,5 +109,5 @@ def _row(want: Wanted, drives: CellDrives, domain: Domain) -> TableRow:
         total_std_m=float(np.std(by_seed, ddof=1)) if len(by_seed) > 1 else None,
         plain_total_m=float(np.mean([total for _, driven in found for total in driven.none_total_cte_m])),
         ticks=found[0][0].ticks,
-        excess=make_row(drives, want.key, domain),
+        excess=make_row(drives, key, domain),
     )

@@ -8,7 +8,7 @@ import yaml
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.reference import Reference
-from advnerf_core.report.result_table import Wanted, make_table
+from advnerf_core.report.result_table import make_table
 from advnerf_core.report.targets import evaluate
 from benchmarks import black_box, experiment_rows, first_build_ratios, retraining, transfer_table
 from benchmarks.black_box import Search
@@ -71,7 +71,7 @@ def test_rounds_and_their_curve_are_published_as_they_were_found(tmp_path):
 
 def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     cells = [CellResult.model_validate(cell(seed, "gradient", 9.0)) for seed in (0, 1)]
-    table = make_table([Wanted("right", "", "hardened", "gradient", (0, 1, 2))], cells)
+    table = make_table({("right", "", "hardened", "gradient"): (0, 1, 2)}, cells)
     rows = rows_of(table)
     assert [(row.domain, row.ratio, target.met) for row, _, target in rows] == [
         ("surrogate", 4.5, None),
@@ -88,7 +88,7 @@ def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     assert "builds" not in note
     anew = [cells[0], cells[1].model_copy(update={"stages": {"scene": "s1"}})]
     assert "seeds are of 2 builds of scene and policies" in transfer_table.note_of(rows[0][0], anew)
-    whole = make_table([Wanted("right", "", "hardened", "gradient", (0, 1))], cells)
+    whole = make_table({("right", "", "hardened", "gradient"): (0, 1)}, cells)
     assert [target.met for _, _, target in rows_of(whole)] == [True, True]
 
 
@@ -96,9 +96,7 @@ def test_a_miss_says_by_how_much_and_what_that_is_on_the_road():
     extra = {"extra": {"horizon": 60}}
     cells = [CellResult.model_validate({**cell(seed, "random", 3.0), **extra}) for seed in (0, 1)]
     cells += [CellResult.model_validate({**cell(seed, "none", 2.0), **extra}) for seed in (0, 1)]
-    table = make_table(
-        [Wanted("right", "", "hardened", method, (0, 1)) for method in ("none", "random")], cells
-    )
+    table = make_table({("right", "", "hardened", method): (0, 1) for method in ("none", "random")}, cells)
     rows = dict((row.domain, (row, target)) for row, _, target in rows_of(table))
     row, target = rows["deployed"]
     why = transfer_table.why_missed(target, row, table.cells_of(row))
@@ -120,7 +118,7 @@ def test_a_missed_target_says_by_how_much_and_what_it_points_to():
         CellResult.model_validate({**cell(seed, "gradient", 6.0), "scenario": "straight_shape_1m"})
         for seed in (0, 1)
     ]
-    table = make_table([Wanted("straight_shape_1m", "", "hardened", "gradient", (0, 1))], cells)
+    table = make_table({("straight_shape_1m", "", "hardened", "gradient"): (0, 1)}, cells)
     ((row, _, target),) = [each for each in rows_of(table) if each[0].domain == "deployed"]
     assert transfer_table.base_m(cells, "deployed") == 2.0
     text = transfer_table.why_missed(target, row, cells)
@@ -133,7 +131,7 @@ def test_places_must_beat_random_ones_on_the_retrained_victim():
         data = {**cell(0, method, deployed_m), "scenario": "left_places", "victim": "retrained"}
         return CellResult.model_validate(data)
 
-    wanted = [Wanted("left_places", "", "retrained", method, (0,)) for method in ("random", "gradient")]
+    wanted = {("left_places", "", "retrained", method): (0,) for method in ("random", "gradient")}
     for gradient_m, met in ((6.0, True), (4.0, False), (3.0, False)):
         table = make_table(wanted, [places("random", 4.0), places("gradient", gradient_m)])
         found = {(row.method, row.domain): target for row, _, target in rows_of(table)}

@@ -18,12 +18,26 @@ Key = tuple[str, str, str, str]  # scenario, placement, victim, method
 
 
 @dataclass(frozen=True)
-class Row:
+class RowOf:
+    """What a row is of: a method, or ``none``, against a victim in one domain."""
+
+    scenario: str
+    placement: str
+    victim: str
+    method: str
+    domain: Domain
+
+    @property
+    def key(self) -> Key:
+        """Scenario, placement, victim and method."""
+        return self.scenario, self.placement, self.victim, self.method
+
+
+@dataclass(frozen=True)
+class Row(RowOf):
     """One method against one victim in one domain, over its searches and their starts.
 
     Attributes:
-        method: Name of the method, or ``none``.
-        domain: surrogate or deployed.
         excess_m: Mean excess |CTE| per tick over the plain object [m]; for ``none`` its mean |CTE|.
         low_m: Lower end of its interval [m]; None with too few drives.
         high_m: Upper end [m].
@@ -38,11 +52,6 @@ class Row:
         registered: Whether all its cells were registered; else it is exploration.
     """
 
-    scenario: str
-    placement: str
-    victim: str
-    method: str
-    domain: Domain
     searches: int
     drives: int
     excess_m: float

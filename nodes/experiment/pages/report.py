@@ -19,6 +19,7 @@ from advnerf_core.policies.network import tensor_to_images
 from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.data import ReportData
+from advnerf_core.report.reference import DOMAINS
 from advnerf_core.report.result_page import not_driven, text_table
 from advnerf_core.report.result_table import ResultTable, make_table
 from advnerf_core.report.targets import Target, evaluate, target_table
@@ -137,11 +138,8 @@ def table_of(experiment: Experiment) -> ResultTable:
     plan = experiment.cells
     files = [experiment.cell_result(cell) for cell in plan]
     found = [read_cell(file) for file in files if file.exists()]
-    return make_table(
-        wanted_rows(plan, experiment.config.deploy.through != "nothing"),
-        found,
-        experiment.config.name,
-    )
+    domains = DOMAINS[:1] if experiment.config.deploy.through == "nothing" else DOMAINS
+    return make_table(wanted_rows(plan), found, experiment.config.name, domains)
 
 
 def textures_seen(

@@ -10,17 +10,18 @@ from markupsafe import Markup
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import order_of
+from advnerf_core.report.evidence.rows import Key
 from advnerf_core.report.pages import FirstScreen
 from advnerf_core.report.result_page import as_csv, as_json, as_markdown, gather_clips, render_page
-from advnerf_core.report.result_table import ResultTable, Wanted
+from advnerf_core.report.result_table import ResultTable
 from advnerf_core.report.targets import Target
 from nodes.experiment.pages.opening import Wording, opening
 from nodes.experiment.plan.cell import Cell
 
 
-def wanted_rows(cells: Sequence[Cell], deployed: bool = True) -> list[Wanted]:
-    """The lines of the cells, in the order in which their paths and variants appear; in the learned scene alone if nothing is deployed."""
-    seeds: dict[tuple[str, str, str, str], list[int]] = {}
+def wanted_rows(cells: Sequence[Cell]) -> dict[Key, list[int]]:
+    """The seeds of each line of the cells, in the order in which their paths and variants appear."""
+    seeds: dict[Key, list[int]] = {}
     for cell in cells:
         seeds.setdefault((cell.scenario, "", cell.victim, cell.method), []).append(cell.seed)
     scenarios = list(dict.fromkeys(scenario for scenario, _, _, _ in seeds))
@@ -30,7 +31,7 @@ def wanted_rows(cells: Sequence[Cell], deployed: bool = True) -> list[Wanted]:
         seeds,
         key=lambda key: (scenarios.index(key[0]), victims.index(key[2]), order_of(key[3])),
     )
-    return [Wanted(*key, tuple(seeds[key]), deployed) for key in order]
+    return {key: seeds[key] for key in order}
 
 
 def write_table(

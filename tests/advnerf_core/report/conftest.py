@@ -13,7 +13,7 @@ from advnerf_core.report import clips
 from advnerf_core.report import data as rd
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.reference import DOMAINS
-from advnerf_core.report.result_table import Wanted, make_table
+from advnerf_core.report.result_table import make_table
 
 SIDE, RADIUS, SPEED, PERIOD, OFF_TRACK = 4.0, 1.1, 0.8, 0.1, 0.4
 STRAIGHT = SIDE - 2 * RADIUS
@@ -75,7 +75,7 @@ def table(drives, ticks=60, **changes):
     for method, found in parts.items():
         cell = {**known, "method": method, "surrogate": next(iter(found.values())), **found}
         cells.append(CellResult.model_validate(cell))
-    wanted = [Wanted("track", "", "hardened", name, (0,)) for name in ("none", "random", "gradient")]
+    wanted = {("track", "", "hardened", name): (0,) for name in ("none", "random", "gradient")}
     return make_table(wanted, cells, "room")
 
 

@@ -8,7 +8,7 @@ import pytest
 from advnerf_core.report import pages, sections
 from advnerf_core.report.data import Film, Texture
 from advnerf_core.report.result_page import render_page
-from advnerf_core.report.result_table import ResultTable, Wanted, make_table
+from advnerf_core.report.result_table import ResultTable, make_table
 from advnerf_core.report.sections import page_sections
 from nodes.experiment.pages.opening import Wording, first_screen, summaries
 
@@ -204,7 +204,7 @@ def test_every_victim_has_its_sentence_on_the_first_screen(report, make):
         for victim in ("hardened", "naive")
         for cell in make.table(drives_of(([13.2], [True]))).cells.values()
     ]
-    wanted = [Wanted("track", "", victim, name, (0,)) for victim in ("hardened", "naive") for name in METHODS]
+    wanted = {("track", "", victim, name): (0,) for victim in ("hardened", "naive") for name in METHODS}
     first = first_screen(report, make_table(wanted, cells), "naive", LAB)
     assert first.sentence.startswith("In the simulated lab the car left its track")
     assert [name for name, _ in first.more] == ["track, hardened policy"]
