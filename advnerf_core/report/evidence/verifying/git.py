@@ -7,7 +7,6 @@ import os
 import subprocess
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 from advnerf_core.errors import AdvnerfError
@@ -43,7 +42,6 @@ class History:
 
     def __init__(self, folder: Path, paths: Sequence[str]) -> None:
         self.folder = folder
-        self._known: dict[str, set[str]] = {}
         known = self._git("rev-parse", "--is-shallow-repository", "--show-prefix", "--verify", "HEAD").split(
             "\n"
         )
@@ -87,25 +85,9 @@ class History:
             yield data[end + 1 : end + 1 + size]
             at = end + size + 2
 
-    def is_before(self, commit: str, other: str) -> bool:
-        """Whether a commit is a proper ancestor of another one."""
-        return commit != other and commit in self._ancestors(other)
-
-    def _ancestors(self, commit: str) -> set[str]:
-        if commit not in self._known:
-            found, waiting = set(), [commit]
-            while waiting:
-                for parent in self._parents.get(waiting.pop(), ()):
-                    if parent not in found:
-                        found.add(parent)
-                        waiting.append(parent)
-            self._known[commit] = found
-        return self._known[commit]
-
-    @cached_property
-    def _parents(self) -> dict[str, list[str]]:
-        lines = self._git("rev-list", "--parents", "HEAD").split("\n")
-        return {line.split()[0]: line.split()[1:] for line in lines if line}
+    def after(self, commit: str) -> set[str]:
+        """All commits of the history that a commit is a proper ancestor of."""
+        return set(self._git("rev-list", "--ancestry-path", f"{commit}..HEAD").split())
 
     def _git(self, *arguments: str) -> str:
         return self._run(arguments, b"").decode(errors="replace")

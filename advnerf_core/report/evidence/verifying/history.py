@@ -76,8 +76,9 @@ def _set_problems(history: History, folder: Path, log: Log) -> Iterator[str]:
         yield f"{folder / FILE}: is not the one that was committed in {last.commit[:9]}"
     if len(registered) > 1 and ("registration", name) not in log:
         yield f"{folder / FILE}: was changed in {last.commit[:9]} after it had been committed, and {LOG} does not say why"
+    later = history.after(last.commit)
     for file, changes in cells:
-        if changes and not history.is_before(last.commit, changes[0].commit):
+        if changes and changes[0].commit not in later:
             yield f"{file}: was committed in {changes[0].commit[:9]}, which does not come after its registration in {last.commit[:9]}"
 
 
