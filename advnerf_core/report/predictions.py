@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
@@ -46,10 +46,6 @@ class Predicted:
     def measured_m(self) -> float:
         """Mean of the deployed drives [m]."""
         return float(np.mean(self.drives_m))
-
-    def record(self) -> dict[str, Any]:
-        """JSON-ready values."""
-        return asdict(self)
 
 
 def prediction_table(pairs: Sequence[Predicted]) -> Table:

@@ -9,7 +9,7 @@ import io
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +143,7 @@ def as_json(table: ResultTable, targets: Sequence[Target] = ()) -> dict[str, Any
         "schema": SCHEMA,
         "name": table.name,
         "rows": [row.record() for row in table.rows],
-        "targets": [target.record() for target in targets],
+        "targets": [asdict(target) for target in targets],
         "cells": {name: cell.model_dump(mode="json") for name, cell in table.cells.items()},
     }
 

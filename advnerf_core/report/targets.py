@@ -5,8 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.evidence.words import collisions
@@ -33,10 +32,6 @@ class Target:
     met: bool | None
     verdict: str
     paper: str
-
-    def record(self) -> dict[str, Any]:
-        """JSON-ready values, from which ``Target(**record)`` restores it."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)

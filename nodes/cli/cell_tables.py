@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -147,7 +147,7 @@ def _write_and_print(
         sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []
         page = write_table(full, clips_folder, output, sections, targets=targets)
         if pairs:
-            write_json(output / "predictions.json", [pair.record() for pair in pairs])
+            write_json(output / "predictions.json", [asdict(pair) for pair in pairs])
     console = Console(width=None if sys.stdout.isatty() else 200)
     console.print(text_table(full).rich())
     if targets:

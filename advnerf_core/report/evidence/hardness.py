@@ -224,24 +224,13 @@ def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
     """The published numbers of a set, the content of its ``set.json``, with its victims' names on pages."""
     titles = titles_of(folder, data)
 
-    def titled(row: Mapping[str, Any]) -> dict[str, Any]:
-        return {**row, "victim": titles.get(row["victim"], row["victim"])}
+    def titled(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {k: titles.get(v, v) if k == "victim" else titled(v) for k, v in value.items()}
+        return [titled(each) for each in value] if isinstance(value, list) else value
 
-    return {
-        **data,
-        "rows": [titled(row) for row in data["rows"]],
-        "primary": [{**test, "test": titled(test["test"])} for test in data["primary"]],
-        **{
-            part: [titled(row) for row in data[part]]
-            for part in ("contrasts", "does_not_drive_well")
-            if part in data
-        },
-        **(
-            {"claims": [{**row, "each": [titled(each) for each in row["each"]]} for row in data["claims"]]}
-            if "claims" in data
-            else {}
-        ),
-    }
+    found: dict[str, Any] = titled(data)
+    return found
 
 
 def _judged_before(cell: CellResult, record: HardnessRecord, baselines: Collection[str]) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,7 @@ class TestResult:
     p_surrogate: float | None
     searches: dict[str, list[SearchMeans]]
     anytime: AnytimeTest
-    mcnemar: tuple[McNemar, ...] = field(default=())
+    mcnemar: tuple[McNemar, ...] = ()
 
 
 class Evidence(CellDrives):
@@ -176,14 +176,7 @@ def as_data(evidence: Evidence) -> dict[str, Any]:
         "searches": search_list(evidence),
         "rows": [vars(row) for row in rows(evidence)],
         "primary": [
-            {
-                **vars(test),
-                "test": test.test.model_dump(mode="json"),
-                "searches": {name: [vars(each) for each in found] for name, found in test.searches.items()},
-                "anytime": vars(test.anytime),
-                "mcnemar": [vars(each) for each in test.mcnemar],
-            }
-            for test in primary_tests(evidence)
+            {**asdict(test), "test": test.test.model_dump(mode="json")} for test in primary_tests(evidence)
         ],
     }
 

@@ -2,6 +2,7 @@
 import csv
 import io
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -169,7 +170,7 @@ def test_targets_are_met_missed_or_not_measured(table):
     assert (random.value, random.met) == (1.4, False)
     assert random.verdict == "missed by 17 %"
     assert (random.target, random.paper) == ("≤ 1.2 × plain object", "1193 ± 19, 1.02 ×")
-    assert Target(**json.loads(json.dumps(random.record()))) == random
+    assert Target(**json.loads(json.dumps(asdict(random)))) == random
     empty = {t.verdict for t in targets_of(make_table(WANTED, []))}
     assert empty == {"not measured"}
 
