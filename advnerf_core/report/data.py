@@ -90,10 +90,8 @@ class Texture:
 
     label: str
     condition: str
-    image: Image | None
-    attack_id: str = ""
-    seed: int = 0
-    victim: str = "hardened"
+    image: Image
+    attack_id: str
 
 
 @dataclass(frozen=True)
@@ -165,34 +163,30 @@ class FidelityView:
     label: str
     psnr_full_db: float
     psnr_policy_db: float
-    ssim_full: float | None = None
-    ssim_policy: float | None = None
-    steering_real_rad: float | None = None
-    steering_surrogate_rad: float | None = None
+    ssim_full: float
+    ssim_policy: float
+    steering_real_rad: float
+    steering_surrogate_rad: float
     real: Image | None = None
     surrogate: Image | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Fidelity:
-    """All held-out views; the aggregates are means over them, None without any measured value. ``unit`` is the unit of the policy's control."""
+    """All held-out views; the aggregates are means over them, None without any. ``unit`` is the unit of the policy's control."""
 
     views: tuple[FidelityView, ...]
     unit: str = "rad"
 
     def mean(self, name: str) -> float | None:
-        """Mean of one numeric field of `FidelityView` over the views with a value."""
-        values = [getattr(v, name) for v in self.views if getattr(v, name) is not None]
+        """Mean of one numeric field of `FidelityView` over the views."""
+        values = [getattr(v, name) for v in self.views]
         return float(np.mean(values)) if values else None
 
     @property
     def steering_rad(self) -> NDArray[np.float64]:
-        """Steering on the real and on the surrogate's image, ``[n, 2]`` [rad], of the views with both."""
-        pairs = [
-            (v.steering_real_rad, v.steering_surrogate_rad)
-            for v in self.views
-            if v.steering_real_rad is not None and v.steering_surrogate_rad is not None
-        ]
+        """Steering on the real and on the surrogate's image of each view, ``[n, 2]`` [rad]."""
+        pairs = [(v.steering_real_rad, v.steering_surrogate_rad) for v in self.views]
         return np.array(pairs, dtype=np.float64).reshape(-1, 2)
 
     @property
@@ -230,13 +224,13 @@ class Latency:
     Attributes:
         capture_to_serial_ms: From the capture of an image to the serial write it caused, per frame, ``[n]`` [ms].
         camera_period_ms: Time between frames [ms].
-        missed_ticks: Control ticks without a command; None if not counted.
+        missed_ticks: Control ticks without a command.
         hops: The same latency hop by hop.
     """
 
     capture_to_serial_ms: Floats
-    camera_period_ms: float = 100.0
-    missed_ticks: int | None = None
+    camera_period_ms: float
+    missed_ticks: int
     hops: tuple[Hop, ...] = ()
 
     @property
@@ -253,11 +247,11 @@ class Manifest:
     """
 
     command: str
-    hashes: Mapping[str, str] = field(default_factory=dict)
-    versions: Mapping[str, str] = field(default_factory=dict)
-    machine: Mapping[str, str] = field(default_factory=dict)
-    settings: Mapping[str, str] = field(default_factory=dict)
-    timings: Mapping[str, float] = field(default_factory=dict)
+    hashes: Mapping[str, str]
+    versions: Mapping[str, str]
+    machine: Mapping[str, str]
+    settings: Mapping[str, str]
+    timings: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from markupsafe import escape
+from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -219,7 +219,7 @@ def _legend_above(ax: Any, handles: list[Any]) -> None:
         ax.figure.legend(handles=handles, loc="outside upper left", ncols=columns, columnspacing=1.6)
 
 
-def svg(figure: Figure, description: str) -> str:
+def svg(figure: Figure, description: str) -> Markup:
     """A figure as inline SVG in the page's colours: no scripts, no external names, text as text.
 
     The description is plain text for readers who cannot see the figure; it is escaped.
@@ -237,7 +237,7 @@ def svg(figure: Figure, description: str) -> str:
     shown = f'viewBox="{view_box[1]}"' if view_box else ""
     label = f'role="img" aria-label="{escape(description)}" style="max-width: {width_px:.0f}px"'
     text = f"<svg {shown} {label}>" + text[text.index(">") + 1 :]
-    return themed_svg(text)
+    return Markup(themed_svg(text))
 
 
 def write_png(figure: Figure, path: Path, dpi: int = 160) -> Path:

@@ -120,7 +120,7 @@ def prediction_section(pairs: Sequence[Predicted]) -> Markup:
     if pairs:
         from advnerf_core.report.plots import svg  # matplotlib
 
-        picture = Markup(svg(prediction_plot(pairs), "Deployed over expected excess"))
+        picture = svg(prediction_plot(pairs), "Deployed over expected excess")
         parts += [
             Markup('<figure class="single" style="max-width: 560px">{}</figure>').format(picture),
             prediction_table(pairs).html(),

@@ -49,7 +49,7 @@ def _fragments(data: ReportData, table: ResultTable) -> Any:
         memory_rows=_memory_table(data).html(),
         timings=_timing_table(data).html(),
         figures=_figures(data),
-        textures=[(t, image_uri(t.image)) for t in data.textures if t.image is not None],
+        textures=[(t, image_uri(t.image)) for t in data.textures],
         pairs_of_views=_views(data),
         fidelity_rows=_fidelity_numbers(data),
         missing=lambda part: data.not_measured.get(part, ""),
@@ -87,26 +87,24 @@ def _figures(data: ReportData) -> dict[str, Any]:
         made["latency"] = plots.latency_histogram(data.latency), "Histogram of capture-to-serial latency"
     if data.memory_mib:
         made["memory"] = plots.memory_against_horizon(data.memory_mib), "Peak memory against the horizon"
-    return {name: _svg(*each) for name, each in made.items()}
+    return {name: plots.svg(*each) for name, each in made.items()}
 
 
 def _run_figures(driven: Drives, victim: str, whole: bool) -> dict[str, Markup]:
     text = f"All drives of the victim {victim} from above"
-    out = {"zoom": _svg(maps.trajectory_map(driven, victim), text)}
+    out = {"zoom": plots.svg(maps.trajectory_map(driven, victim), text)}
     if whole:
-        out["whole"] = _svg(maps.trajectory_map(driven, victim, zoom=False), f"{text}, in the whole place")
+        out["whole"] = plots.svg(
+            maps.trajectory_map(driven, victim, zoom=False), f"{text}, in the whole place"
+        )
     for domain in DOMAINS:
         if driven.select(victim=victim, domain=domain):
             figure = plots.cte_over_time(driven, domain, victim)
-            out[domain] = _svg(figure, f"Cross-track error over time, {domain}")
+            out[domain] = plots.svg(figure, f"Cross-track error over time, {domain}")
     if any(c.victim == victim for c in driven.curves):
         figure = plots.loss_curves(driven, victim)
-        out["curves"] = _svg(figure, "Excess of each evaluation of the searches over the plain object")
+        out["curves"] = plots.svg(figure, "Excess of each evaluation of the searches over the plain object")
     return out
-
-
-def _svg(figure: Any, description: str) -> Markup:
-    return Markup(plots.svg(figure, description))
 
 
 def _views(data: ReportData) -> list[dict[str, Any]]:

@@ -119,7 +119,7 @@ def _above(result: AuditResult, judged: Mapping[str, ArmDrives], path: Path) -> 
         for name in (NO_OBJECT, PLAIN_OBJECT, FOUND)
     ]
     figure = drives_from_above(scene, arms)
-    return Markup(plots.svg(figure, "All judged drives from above, the lane, and the object where it stands"))
+    return plots.svg(figure, "All judged drives from above, the lane, and the object where it stands")
 
 
 def _corners(placed: AuditedObject) -> np.ndarray:

@@ -241,8 +241,6 @@ def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
             cell.method,
             attack.required_face().texture,
             attack.attack_id,
-            cell.seed,
-            cell.victim,
         )
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from markupsafe import Markup
-
 from advnerf_core.driving.metrics import drives, mean_cte_limit_m
 from advnerf_core.report.conditions import CONTROLS, NONE, compared
 from advnerf_core.report.data import ReportData
@@ -56,7 +54,7 @@ def first_screen(data: ReportData, table: ResultTable, victim: str, wording: Wor
         said,
         film=driven.film if fits(driven.film) else None,
         film_caption=f"From the driver's seat: {where}.",
-        above=Markup(svg(drives_from_above(driven.scene, arms), "The drives from above, the track, and the object where it stands")),
+        above=svg(drives_from_above(driven.scene, arms), "The drives from above, the track, and the object where it stands"),
         above_caption=f"From above: {number_of}, {where}. Green: on track. Dots: where a drive ended.",
     )  # fmt: skip
 

@@ -250,7 +250,7 @@ def full_report(folder: Path, steps=60):
     ]
     curves.append(rd.LossCurve("random", 0, rng.gamma(2, 0.01, 50)))
     textures = [
-        rd.Texture(f"gradient, seed {s}", "gradient", colour_grid(s, 3.0), f"9f3a{s}c", s) for s in (0, 1, 2)
+        rd.Texture(f"gradient, seed {s}", "gradient", colour_grid(s, 3.0), f"9f3a{s}c") for s in (0, 1, 2)
     ]
     textures.append(rd.Texture("best random", "random", colour_grid(9, 5.0), "41b07e"))
     return rd.ReportData(
@@ -275,7 +275,7 @@ def bare_report():
     """Only what a report cannot do without."""
     return rd.ReportData(
         (drives(),),
-        rd.Manifest("advnerf experiment run"),
+        manifest(),
         live=True,
         not_measured={"latency": "No <live> drive."},
     )

@@ -89,8 +89,8 @@ def test_the_page_is_whole_and_loads_nothing(report):
 def test_missing_parts_are_named(bare_report):
     page = page_of(bare_report)
     check(page)
-    # drives, fidelity, laps, latency, memory, timings
-    assert page.count("Not measured in this run.") == 6
+    # drives, fidelity, laps, latency, memory
+    assert page.count("Not measured in this run.") == 5
     assert "No &lt;live&gt; drive." in page
 
 

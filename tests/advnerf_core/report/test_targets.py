@@ -62,7 +62,6 @@ def test_random_may_neither_be_strong_nor_leave(bare_report, make, ratio, left):
         ((20.0, 30.0), 0, True, True),
         ((20.0, 130.0), 0, False, True),
         ((20.0,), 1, True, False),
-        ((20.0,), None, True, None),
     ],
 )
 def test_latency(bare_report, samples, missed, fast, none_missed):
@@ -80,8 +79,8 @@ def test_memory_needs_both_horizons(bare_report):
 
 def test_fidelity_and_laps(bare_report):
     views = (
-        FidelityView("a", 26.0, 30.0, None, None, 0.1, 0.139),
-        FidelityView("b", 27.0, 24.5, None, None, 0.1, 0.08),
+        FidelityView("a", 26.0, 30.0, 0.9, 0.9, 0.1, 0.139),
+        FidelityView("b", 27.0, 24.5, 0.9, 0.9, 0.1, 0.08),
     )
     laps = Laps(3, np.zeros((4, 3)), np.zeros(4), 0.079, False)
     found = verdicts(replace(bare_report, fidelity=Fidelity(views), laps=laps))
@@ -94,7 +93,7 @@ def test_fidelity_and_laps(bare_report):
 
 
 def test_the_verdict_names_every_miss(bare_report):
-    views = (FidelityView("fox photographs", 24.1, 24.1, None, None, 0.0, 0.0),)
+    views = (FidelityView("fox photographs", 24.1, 24.1, 0.9, 0.9, 0.0, 0.0),)
     limit = Limit(what="fox photographs", of="psnr_full_db", at_least=26)
     measured = replace(bare_report, fidelity=Fidelity(views)).measured
     text = verdict(evaluate([limit], NO_ROWS, measured))
