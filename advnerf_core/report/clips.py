@@ -20,7 +20,7 @@ import av
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image, ImageDraw, ImageFont  # comes with matplotlib
+from PIL import Image, ImageColor, ImageDraw, ImageFont  # comes with matplotlib
 
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import Film
@@ -29,7 +29,6 @@ from advnerf_core.report.palette import DARK
 MAX_BYTES = 1_500_000
 _QUALITIES = (24, 28, 32, 36, 40, 44)  # constant rate factors: larger is smaller and worse
 _TITLE_PX, _STATUS_PX, _GAP_PX, _MIN_WIDTH_PX = 22, 22, 6, 320
-_MEDIA_TYPES = {".mp4": "video/mp4", ".webm": "video/webm", ".png": "image/png", ".jpg": "image/jpeg"}
 
 Frames = NDArray[np.uint8]
 
@@ -114,7 +113,7 @@ def compose(tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: flo
         heights = {p.shape[0] for p in panels}
         if len(heights) > 1:
             raise ValueError(f"expected drives of one frame size side by side, got heights {sorted(heights)}")
-        gap = np.full((panels[0].shape[0], _GAP_PX, 3), _rgb("paper"), np.uint8)
+        gap = np.full((panels[0].shape[0], _GAP_PX, 3), ImageColor.getrgb(DARK["paper"]), np.uint8)
         row = np.concatenate([part for p in panels for part in (gap, p)][1:], axis=1)
         # 4:2:0 video has even sides.
         yield np.pad(row, ((0, row.shape[0] % 2), (0, row.shape[1] % 2), (0, 0)), mode="edge")
@@ -137,19 +136,22 @@ def webp(frames: Sequence[Image.Image], frame_ms: float, quality: int) -> bytes:
     return buffer.getvalue()
 
 
-def data_uri(path: Path) -> str:
-    """A media file as a data URI."""
-    kind = _MEDIA_TYPES.get(path.suffix.lower())
-    if kind is None:
-        raise ValueError(f"expected a file of type {', '.join(_MEDIA_TYPES)}, got {path}")
-    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+def film_uri(file: Path) -> str:
+    """A film, which `write_clip` wrote, as a data URI."""
+    return _data_uri(f"video/{file.suffix[1:]}", file.read_bytes())
 
 
 def image_uri(image: Frames, quality: int | None = None) -> str:
     """An RGB image as a data URI: PNG, or JPEG of the given quality."""
-    suffix, options = (".png", []) if quality is None else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
-    _, encoded = cv2.imencode(suffix, cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), options)
-    return f"data:{_MEDIA_TYPES[suffix]};base64,{base64.b64encode(encoded.tobytes()).decode()}"
+    kind, options = ("png", []) if quality is None else ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, encoded = cv2.imencode(
+        f".{kind}", cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), options
+    )
+    return _data_uri(f"image/{kind}", encoded.tobytes())
+
+
+def _data_uri(media_type: str, data: bytes) -> str:
+    return f"data:{media_type};base64,{base64.b64encode(data).decode()}"
 
 
 def frame_of(path: Path, number: int) -> Frames:
@@ -187,7 +189,7 @@ def _panel(track: ClipTrack, step: int, rate_hz: float, off_track_m: float) -> F
     )  # the policy's 200-pixel views are doubled to hold the caption
     image = np.repeat(np.repeat(image, scale, axis=0), scale, axis=1)
     height, width = image.shape[:2]
-    canvas = Image.new("RGB", (width, _TITLE_PX + height + _STATUS_PX), _rgb("paper"))
+    canvas = Image.new("RGB", (width, _TITLE_PX + height + _STATUS_PX), DARK["paper"])
     # Captions go on top: a player puts its controls over the bottom.
     canvas.paste(Image.fromarray(image), (0, _TITLE_PX + _STATUS_PX))
     cte = float(np.asarray(track.cte_m)[index])
@@ -198,13 +200,13 @@ def _panel(track: ClipTrack, step: int, rate_hz: float, off_track_m: float) -> F
 
 def _draw_title(canvas: Image.Image, track: ClipTrack) -> None:
     draw = ImageDraw.Draw(canvas)
-    draw.rectangle((0, 0, 4, _TITLE_PX - 3), fill=_rgb(style_of(track.condition).key))
-    draw.text((11, _TITLE_PX / 2 - 1), track.title, fill=_rgb("ink"), font=_font(13, bold=True), anchor="lm")
+    draw.rectangle((0, 0, 4, _TITLE_PX - 3), fill=style_of(track.condition).dark)
+    draw.text((11, _TITLE_PX / 2 - 1), track.title, fill=DARK["ink"], font=_font(13, bold=True), anchor="lm")
     if track.attack_id:
         draw.text(
             (canvas.width - 2, _TITLE_PX / 2 - 1),
             track.attack_id,
-            fill=_rgb("muted"),
+            fill=DARK["muted"],
             font=_font(11),
             anchor="rm",
         )
@@ -214,32 +216,27 @@ def _draw_status(canvas: Image.Image, time_s: float, cte_m: float, off_track_m: 
     """Draws time, cross-track error as a number and as a needle over the track's width, and the text OFF TRACK."""
     draw = ImageDraw.Draw(canvas)
     middle = _TITLE_PX + _STATUS_PX / 2 - 2
-    draw.text((2, middle), f"{time_s:4.1f} s", fill=_rgb("ink"), font=_font(12), anchor="lm")
-    draw.text((62, middle), f"CTE {cte_m:+.2f} m", fill=_rgb("ink"), font=_font(12), anchor="lm")
+    draw.text((2, middle), f"{time_s:4.1f} s", fill=DARK["ink"], font=_font(12), anchor="lm")
+    draw.text((62, middle), f"CTE {cte_m:+.2f} m", fill=DARK["ink"], font=_font(12), anchor="lm")
     off = abs(cte_m) > off_track_m
     # The needle moves like the car on the screen: left of the path is left.
     left, right = 160, 236
     centre, metre = (left + right) / 2, (right - left) / 4 / off_track_m
-    draw.rectangle((left, middle - 4, right, middle + 4), fill=_rgb("grid"))
+    draw.rectangle((left, middle - 4, right, middle + 4), fill=DARK["grid"])
     draw.rectangle(
         (centre - off_track_m * metre, middle - 4, centre + off_track_m * metre, middle + 4),
-        fill=_rgb("tape"),
+        fill=DARK["tape"],
     )
     at = float(np.clip(centre - cte_m * metre, left + 1, right - 1))
-    draw.rectangle((at - 1.5, middle - 7, at + 1.5, middle + 7), fill=_rgb("ink"))
+    draw.rectangle((at - 1.5, middle - 7, at + 1.5, middle + 7), fill=DARK["ink"])
     text = " · ".join([*(["OFF TRACK"] if off else []), *([note] if note else [])])
     draw.text(
         (canvas.width - 2, middle),
         text,
-        fill=_rgb("gradient" if off else "muted"),
+        fill=DARK["gradient" if off else "muted"],
         font=_font(12, bold=off),
         anchor="rm",
     )
-
-
-def _rgb(name: str) -> tuple[int, int, int]:
-    colour = DARK[name]
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
 @cache
