@@ -30,7 +30,6 @@ class Run:
         seed: Seed of the attack; 0 without randomness.
         states: Pose of the rear axle at the control ticks, ``[T + 1, 3]``: x [m], y [m], yaw [rad], world.
         cte_m: Signed cross-track error at the control ticks, left positive, ``[T + 1]`` [m].
-        total_cte_m: Sum of ``|CTE|`` over the horizon [m].
         note: Remark for readers, such as "stopped by the fence at 5.1 s".
     """
 
@@ -41,7 +40,6 @@ class Run:
     start: int
     states: Floats
     cte_m: Floats
-    total_cte_m: float
     note: str = ""
 
 
@@ -79,7 +77,6 @@ class LossCurve:
     """Excess |CTE| per tick of each evaluation of one search, ``[E]`` [m]: over the plain object, from its starts, over its ticks."""
 
     method: str
-    seed: int
     excess_m: Floats
     victim: str = "hardened"
 
@@ -197,27 +194,6 @@ class Fidelity:
 
 
 @dataclass(frozen=True, eq=False)
-class Hop:
-    """Latency of one hop of the live path [ms]."""
-
-    name: str
-    count: int
-    p50_ms: float
-    p95_ms: float
-    p99_ms: float
-    max_ms: float
-
-    @classmethod
-    def from_samples(cls, name: str, samples_ms: ArrayLike) -> Hop:
-        """Percentiles of samples ``[n]`` [ms]."""
-        a = np.asarray(samples_ms, dtype=np.float64)
-        if a.size == 0:
-            raise ValueError(f"expected latency samples of hop {name!r}, got none")
-        p50, p95, p99 = np.percentile(a, [50, 95, 99])
-        return cls(name, a.size, float(p50), float(p95), float(p99), float(a.max()))
-
-
-@dataclass(frozen=True, eq=False)
 class Latency:
     """Live timing.
 
@@ -225,18 +201,18 @@ class Latency:
         capture_to_serial_ms: From the capture of an image to the serial write it caused, per frame, ``[n]`` [ms].
         camera_period_ms: Time between frames [ms].
         missed_ticks: Control ticks without a command.
-        hops: The same latency hop by hop.
+        hops_ms: The time from capture to the publication by each node, ``[n]`` by hop [ms].
     """
 
     capture_to_serial_ms: Floats
     camera_period_ms: float
     missed_ticks: int
-    hops: tuple[Hop, ...] = ()
+    hops_ms: Mapping[str, Floats]
 
     @property
-    def overall(self) -> Hop:
-        """Percentiles from capture to serial write."""
-        return Hop.from_samples("capture to serial write", self.capture_to_serial_ms)
+    def p99_ms(self) -> float:
+        """99th percentile from capture to serial write [ms]."""
+        return float(np.percentile(self.capture_to_serial_ms, 99))
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,7 +266,7 @@ class ReportData:
             found["laps_off_track"] = float(self.laps.off_track)
         if self.latency is not None:
             found |= {
-                "latency_p99_ms": self.latency.overall.p99_ms,
+                "latency_p99_ms": self.latency.p99_ms,
                 "missed_ticks": self.latency.missed_ticks,
             }
         short, long = (self.memory_mib.get(ticks) for ticks in _TICKS_COMPARED)

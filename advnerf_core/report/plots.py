@@ -148,16 +148,16 @@ def steering_agreement(fidelity: Fidelity) -> Figure:
 
 def latency_histogram(latency: Latency) -> Figure:
     """Distribution of the time from capture to serial write, with the camera period as the limit."""
-    samples, limit, overall = latency.capture_to_serial_ms, latency.camera_period_ms, latency.overall
+    samples, limit, p99_ms = latency.capture_to_serial_ms, latency.camera_period_ms, latency.p99_ms
     end = max(limit * 1.12, float(samples.max()) * 1.05)
     with new_axes(6.0, 2.9) as ax:
         ax.hist(samples, bins=np.linspace(0.0, end, 90).tolist(), color=LIGHT["muted"], log=True)
         ax.axvline(limit, color=LIGHT["ink"], lw=1.4)
-        ax.axvline(overall.p99_ms, color=LIGHT["ink"], lw=1.2, ls=":")
+        ax.axvline(p99_ms, color=LIGHT["ink"], lw=1.2, ls=":")
         side = "right" if end < limit * 1.3 else "center"
         for at, text, colour, ha in (
             (limit, f"camera period {limit:g} ms", "ink", side),
-            (overall.p99_ms, f"p99 {overall.p99_ms:.1f} ms", "muted", "center"),
+            (p99_ms, f"p99 {p99_ms:.1f} ms", "muted", "center"),
         ):
             ax.text(at, 1.01, text, transform=ax.get_xaxis_transform(), ha=ha, size=8.5, color=LIGHT[colour])
         ax.set(xlabel="capture to serial write [ms]", ylabel="frames", xlim=(0.0, end))

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from advnerf_core.report import maps, plots
 from advnerf_core.report.clips import Frames, image_uri
 from advnerf_core.report.conditions import style_of
-from advnerf_core.report.data import Drives, Hop, ReportData
+from advnerf_core.report.data import Drives, ReportData
 from advnerf_core.report.pages import HOW, MAX_EMBEDDED_BYTES, fits, fragments
 from advnerf_core.report.reference import DOMAINS
 from advnerf_core.report.result_table import ResultTable
@@ -136,10 +136,11 @@ def _fidelity_numbers(data: ReportData) -> Markup:
 
 def _hop_table(data: ReportData) -> Table:
     """Latency per hop, the whole path last."""
-    hops: tuple[Hop, ...] = () if data.latency is None else (*data.latency.hops, data.latency.overall)
+    latency = data.latency
+    hops = {**latency.hops_ms, "capture to serial write": latency.capture_to_serial_ms} if latency else {}
     cells = tuple(
-        (h.name, str(h.count), *(number(v, 1) for v in (h.p50_ms, h.p95_ms, h.p99_ms, h.max_ms)))
-        for h in hops
+        (name, str(len(ms)), *(number(value, 1) for value in np.percentile(ms, [50, 95, 99, 100])))
+        for name, ms in hops.items()
     )
     columns = ("hop", "frames", "p50 [ms]", "p95 [ms]", "p99 [ms]", "max [ms]")
     return Table("Live latency", columns, cells, (False, *[True] * 5), (len(cells) - 1,))

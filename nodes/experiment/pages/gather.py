@@ -84,7 +84,6 @@ def _drives(
                 0,
                 np.array(empty["states"])[:, :3],
                 np.array(empty["cte_m"]),
-                empty["metrics"]["total_cte_m"],
                 _note(empty),
             )
         )
@@ -99,7 +98,7 @@ def _curves(experiment: Experiment, cell: Cell) -> Iterator[rd.LossCurve]:
     if clean is not None:
         totals_m = np.array(read_json(driven_folder(experiment, cell) / SEARCHED)["curve_total_cte_m"])
         excess_m = (totals_m - clean.mean_total_cte_m) / clean.ticks
-        yield rd.LossCurve(cell.method, cell.seed, excess_m, cell.victim)
+        yield rd.LossCurve(cell.method, excess_m, cell.victim)
 
 
 def _runs(experiment: Experiment, cell: Cell, domain: Domain) -> Iterator[rd.Run]:
@@ -108,12 +107,10 @@ def _runs(experiment: Experiment, cell: Cell, domain: Domain) -> Iterator[rd.Run
         return  # also if a live arm was driven but the one to compare with was not
     found = read_json(file)
     notes = [_note(each) for each in found.get("live", ())] or [""] * len(found["states"])
-    for start, (states, total_m, note) in enumerate(
-        zip(found["states"], found["total_cte_m"], notes, strict=True)
-    ):
+    for start, (states, note) in enumerate(zip(found["states"], notes, strict=True)):
         poses = np.array(states)[:, :3]
         cte_m = experiment.paths[cell.scenario].project(poses[:, :2]).cte_m
-        yield rd.Run(domain, cell.method, cell.victim, cell.seed, start, poses, cte_m, total_m, note)
+        yield rd.Run(domain, cell.method, cell.victim, cell.seed, start, poses, cte_m, note)
 
 
 def _note(live: Mapping[str, Any]) -> str:
@@ -270,12 +267,12 @@ def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latenc
     if not results:
         return None
     samples = np.concatenate([r["capture_to_serial_ms"] for r in results])
-    hops = tuple(
-        rd.Hop.from_samples(f"capture to {name}", np.concatenate([r["hops_ms"][name] for r in results]))
+    hops_ms = {
+        f"capture to {name}": np.concatenate([r["hops_ms"][name] for r in results])
         for name in evaluation.HOPS
-    )
+    }
     period_ms = 1e3 * experiment.config.dt_s
-    return rd.Latency(samples, period_ms, sum(r["missed"] for r in results), hops)
+    return rd.Latency(samples, period_ms, sum(r["missed"] for r in results), hops_ms)
 
 
 def _timings(experiment: Experiment) -> dict[str, float]:

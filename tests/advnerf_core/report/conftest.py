@@ -58,7 +58,6 @@ def drive(domain, condition, amplitude, seed=0, start=0, steps=60, victim="harde
         start=start,
         states=states,
         cte_m=cte,
-        total_cte_m=float(np.abs(cte).sum()),
         note=note,
     )
 
@@ -189,9 +188,7 @@ def latency():
         "policy": rng.gamma(30, 0.4, 900),
         "motor": rng.gamma(4, 0.4, 900),
     }
-    return rd.Latency(
-        sum(hops.values()) + 2, 100.0, 0, tuple(rd.Hop.from_samples(k, v) for k, v in hops.items())
-    )
+    return rd.Latency(sum(hops.values()) + 2, 100.0, 0, hops)
 
 
 def all_runs(starts=2, seeds=(0, 1, 2), victims=("hardened", "naive")):
@@ -245,10 +242,10 @@ def full_report(folder: Path, steps=60):
     rng = np.random.default_rng(2)
     grow = np.arange(1, 51)
     curves = [
-        rd.LossCurve("gradient", s, 0.5 * (1 - np.exp(-grow / (12 + 3 * s))) + rng.normal(0, 0.01, 50))
+        rd.LossCurve("gradient", 0.5 * (1 - np.exp(-grow / (12 + 3 * s))) + rng.normal(0, 0.01, 50))
         for s in (0, 1, 2)
     ]
-    curves.append(rd.LossCurve("random", 0, rng.gamma(2, 0.01, 50)))
+    curves.append(rd.LossCurve("random", rng.gamma(2, 0.01, 50)))
     textures = [
         rd.Texture(f"gradient, seed {s}", "gradient", colour_grid(s, 3.0), f"9f3a{s}c") for s in (0, 1, 2)
     ]

@@ -81,8 +81,8 @@ def test_a_stranger_appears_in_the_report(make):
     amplitudes = {"none": 0.05, "Spiral": 0.5, "cem": 0.3, "gradient": 0.6}
     runs = tuple(make.drive("surrogate", name, amplitude) for name, amplitude in amplitudes.items())
     curves = (
-        LossCurve("Spiral", 0, np.array([1.0, 3.0, 2.0])),
-        LossCurve("gradient", 0, np.array([1.0, 2.0, 3.0])),
+        LossCurve("Spiral", np.array([1.0, 3.0, 2.0])),
+        LossCurve("gradient", np.array([1.0, 2.0, 3.0])),
     )
     drives = make.drives(runs, curves)
     shown = ["plain object", "cross-entropy", "gradient", "Spiral"]

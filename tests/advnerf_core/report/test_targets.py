@@ -65,7 +65,7 @@ def test_random_may_neither_be_strong_nor_leave(bare_report, make, ratio, left):
     ],
 )
 def test_latency(bare_report, samples, missed, fast, none_missed):
-    found = verdicts(replace(bare_report, latency=Latency(np.array(samples), 100.0, missed)))
+    found = verdicts(replace(bare_report, latency=Latency(np.array(samples), 100.0, missed, {})))
     assert found["capture to serial write, live, p99"] is fast
     assert found["control ticks missed, live"] is none_missed
 
