@@ -41,7 +41,7 @@ class Style:
 
 
 def _rows(*styles: Style) -> Mapping[str, Style]:
-    return MappingProxyType({style.key: style for style in styles})
+    return {style.key: style for style in styles}
 
 
 # In the order of tables and legends.
@@ -84,9 +84,10 @@ _PREFERRED = _rows(
     Style("", "spare-6", "#4b3fb5", "#a99cff", "8"),
 )
 _MOST = 24
-SPARE: Mapping[str, Style] = MappingProxyType(
-    {**_PREFERRED, **_rows(*(_generated(number) for number in range(len(_PREFERRED) + 1, _MOST + 1)))}
-)
+SPARE: Mapping[str, Style] = {
+    **_PREFERRED,
+    **_rows(*(_generated(number) for number in range(len(_PREFERRED) + 1, _MOST + 1))),
+}
 # Styles of the methods passed to `know_methods`.
 _known: ContextVar[Mapping[str, Style]] = ContextVar("_known", default=MappingProxyType({}))
 
@@ -110,7 +111,7 @@ def know_methods(names: Iterable[str], titles: Mapping[str, str] | None = None) 
         taken.add(chosen.key)
         title = (titles or {}).get(name) or (known[name].title if name in known else name)
         styles[name] = replace(chosen, title=title)
-    _known.set(MappingProxyType(styles))
+    _known.set(styles)
 
 
 def _preferred(name: str) -> Style:

@@ -7,61 +7,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.resources import files
-from types import MappingProxyType
 
 from advnerf_core.report.conditions import CONDITIONS, SPARE
 
-_STYLES = {**CONDITIONS, **SPARE}
-LIGHT: Mapping[str, str] = MappingProxyType(
-    {
-        **{key: style.light for key, style in _STYLES.items()},
-        "ink": "#1c2128",
-        "muted": "#59626d",
-        "grid": "#dde2e7",
-        "band": "#eaf1ec",
-        "tape": "#3f9b6b",
-        "paper": "#fffffe",
-    }
-)
-DARK: Mapping[str, str] = MappingProxyType(
-    {
-        **{key: style.dark for key, style in _STYLES.items()},
-        "ink": "#e4e8ec",
-        "muted": "#9da7b1",
-        "grid": "#30373f",
-        "band": "#1d2a24",
-        "tape": "#52b788",
-        "paper": "#14181c",
-    }
-)
+# Light and dark, of what figures draw besides the conditions.
+_DRAWN = {
+    "ink": ("#1c2128", "#e4e8ec"),
+    "muted": ("#59626d", "#9da7b1"),
+    "grid": ("#dde2e7", "#30373f"),
+    "band": ("#eaf1ec", "#1d2a24"),
+    "tape": ("#3f9b6b", "#52b788"),
+    "paper": ("#fffffe", "#14181c"),
+}
+# Colours that figures do not use: boxes, marks of good and bad, focus and buttons.
+_SURFACE = {
+    "panel": ("#f7f8f9", "#1b2026"),
+    "good": ("#1c7245", "#5ccb8f"),
+    "bad": ("#b0123c", "#ff8296"),
+    "stop": ("#b0123c", "#d3204a"),
+    "on-stop": ("#ffffff", "#ffffff"),
+    "warn": ("#8a5a00", "#ffc46b"),
+    "accent": ("#00695c", "#4db6a4"),
+    "on-accent": ("#ffffff", "#04211c"),
+}
+_PAIRS = {key: (style.light, style.dark) for key, style in {**CONDITIONS, **SPARE}.items()} | _DRAWN
+LIGHT, DARK = ({name: pair[at] for name, pair in _PAIRS.items()} for at in (0, 1))
+# Of pages: everything.
+PAGE_LIGHT, PAGE_DARK = ({name: pair[at] for name, pair in {**_PAIRS, **_SURFACE}.items()} for at in (0, 1))
 
-# Colours that plots do not use: boxes, marks of good and bad, focus and buttons.
-SURFACE_LIGHT: Mapping[str, str] = MappingProxyType(
-    {
-        "panel": "#f7f8f9",
-        "good": "#1c7245",
-        "bad": "#b0123c",
-        "stop": "#b0123c",
-        "on-stop": "#ffffff",
-        "warn": "#8a5a00",
-        "accent": "#00695c",
-        "on-accent": "#ffffff",
-    }
-)
-SURFACE_DARK: Mapping[str, str] = MappingProxyType(
-    {
-        "panel": "#1b2026",
-        "good": "#5ccb8f",
-        "bad": "#ff8296",
-        "stop": "#d3204a",
-        "on-stop": "#ffffff",
-        "warn": "#ffc46b",
-        "accent": "#4db6a4",
-        "on-accent": "#04211c",
-    }
-)
-
-LINE_STYLES: Mapping[str, str] = MappingProxyType({"surrogate": "--", "deployed": "-"})
+LINE_STYLES = {"surrogate": "--", "deployed": "-"}
 
 
 def css_variables(palette: Mapping[str, str]) -> str:
@@ -71,7 +45,7 @@ def css_variables(palette: Mapping[str, str]) -> str:
 
 def look_css() -> str:
     """The common style sheet of all pages: the palette in both themes, and ``look.css``."""
-    light, dark = css_variables({**LIGHT, **SURFACE_LIGHT}), css_variables({**DARK, **SURFACE_DARK})
+    light, dark = css_variables(PAGE_LIGHT), css_variables(PAGE_DARK)
     shared = files("advnerf_core.report").joinpath("look.css").read_text(encoding="utf-8")
     return f":root {{ {light} }}\n@media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n{shared}"
 
