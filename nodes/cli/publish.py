@@ -52,10 +52,10 @@ def publish(
     from advnerf_core.report.evidence import registration
     from advnerf_core.report.evidence.above import write_above_of
     from advnerf_core.report.evidence.publishing import write_numbers, write_page
+    from advnerf_core.report.evidence.registration import SetError
     from advnerf_core.report.evidence.verify import verify_set
     from advnerf_core.report.evidence.verifying import victims
     from advnerf_core.report.evidence.verifying.digests import write_beside
-    from advnerf_core.report.evidence.verifying.layout import SetError
     from nodes.experiment.run.plan import statuses
     from nodes.experiment.run.published import publish as copy_cells
     from nodes.experiment.run.published import publish_build

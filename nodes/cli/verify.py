@@ -36,8 +36,9 @@ def verify(
 ) -> None:
     """Compute every published number again from the kept drives, and check digests, registration, completeness and the history in git."""
     from advnerf_core.report.evidence.kept_build import LOST, is_kept
+    from advnerf_core.report.evidence.registration import SetError
     from advnerf_core.report.evidence.verify import verify_beside, verify_set
-    from advnerf_core.report.evidence.verifying.layout import SetError, sets_in
+    from advnerf_core.report.evidence.verifying.layout import sets_in
     from advnerf_core.report.evidence.verifying.pictures import picture_problems
     from nodes.experiment.run.kept_attacks import with_attacks
     from nodes.experiment.run.redrive import RedriveError

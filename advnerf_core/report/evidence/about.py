@@ -9,17 +9,13 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from advnerf_core.documents import Document, read_json
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.report.evidence.registration import SetError
 from advnerf_core.strict import StrictModel, parse_value
 
 # Beside the folders of the sets.
 ABOUT = "sets_about.json"
 Text = Annotated[str, Field(min_length=1)]
 Positive = Annotated[float, Field(gt=0)]
-
-
-class AboutError(AdvnerfError, ValueError):
-    """A published set has no usable entry in `ABOUT`."""
 
 
 class ObjectPlace(StrictModel):
@@ -77,16 +73,14 @@ def check_about(published: Path, sets: Collection[str]) -> None:
     """Check that the file, if it exists, has one entry for each set.
 
     Raises:
-        AboutError: An entry is missing, or has no set.
+        SetError: An entry is missing, or has no set.
     """
     if not (published / ABOUT).exists():
         return
     entries = read_about(published).keys()
     for name in sorted(set(sets) - entries):
-        raise AboutError(
+        raise SetError(
             f"{published / ABOUT}: expected an entry for {name}, got none; add world, role, after and changed"
         )
     for name in sorted(entries - set(sets)):
-        raise AboutError(
-            f"{published / ABOUT}: expected entries of sets in {published}, got {name}; remove it"
-        )
+        raise SetError(f"{published / ABOUT}: expected entries of sets in {published}, got {name}; remove it")

@@ -11,11 +11,11 @@ from advnerf_core.report.evidence.families import families_note
 from advnerf_core.report.evidence.hardness import with_titles
 from advnerf_core.report.evidence.kept_build import lost_note
 from advnerf_core.report.evidence.page import film_of, results_page
-from advnerf_core.report.evidence.registration import read_registration, read_withdrawn
+from advnerf_core.report.evidence.registration import SetError, read_registration, read_withdrawn
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verifying.checks import set_problems
 from advnerf_core.report.evidence.verifying.digests import digests_of, write_beside, write_known_digest
-from advnerf_core.report.evidence.verifying.layout import PAGE, SET, SetError, complete_sets, read_set
+from advnerf_core.report.evidence.verifying.layout import PAGE, SET, complete_sets, read_set
 from advnerf_core.report.evidence.verifying.numbers import published_numbers
 from advnerf_core.report.evidence.verifying.pictures import write_picture
 from advnerf_core.report.evidence.verifying.victims import read_declared

@@ -26,8 +26,8 @@ Pose = tuple[float, float, float]
 Share = Annotated[float, Field(gt=0, lt=1)]
 
 
-class RegistrationError(AdvnerfError, ValueError):
-    """A registration is not usable, or would come too late."""
+class SetError(AdvnerfError, ValueError):
+    """A set of results, its registration or another of its files is not usable, or would come too late."""
 
 
 class RegisteredScenario(StrictModel):
@@ -205,7 +205,7 @@ def read_registration(folder: FilePath) -> Registration | None:
     """The registration in the folder of a set of results; None without one.
 
     Raises:
-        RegistrationError: The file is not a registration.
+        SetError: The file is not a registration.
     """
     file = folder / FILE
     if not file.exists():
@@ -214,16 +214,14 @@ def read_registration(folder: FilePath) -> Registration | None:
         return Registration.model_validate(read_json(file))
     except (OSError, UnicodeDecodeError, ValidationError) as error:
         text = error.errors(include_url=False)[0]["msg"] if isinstance(error, ValidationError) else str(error)
-        raise RegistrationError(
-            f"{file}: expected a registration, got: {text}; restore it from git"
-        ) from None
+        raise SetError(f"{file}: expected a registration, got: {text}; restore it from git") from None
 
 
 def read_withdrawn(folder: FilePath) -> dict[str, str]:
     """Withdrawn scenarios of a set, each with the reason; empty without any.
 
     Raises:
-        RegistrationError: The file is invalid.
+        SetError: The file is invalid.
     """
     return read_reasons(folder / WITHDRAWN, "withdrawn scenarios")
 
@@ -232,7 +230,7 @@ def read_reasons(file: FilePath, what: str) -> dict[str, str]:
     """Reasons by name, from a file of a set; empty without the file.
 
     Raises:
-        RegistrationError: The file is invalid; the message calls the names ``what``.
+        SetError: The file is invalid; the message calls the names ``what``.
     """
     if not file.exists():
         return {}
@@ -241,9 +239,7 @@ def read_reasons(file: FilePath, what: str) -> dict[str, str]:
         if not all(isinstance(each, str) and each.strip() for pair in found.items() for each in pair):
             raise ValueError("expected a reason for each")
     except (OSError, ValueError, AttributeError) as error:
-        raise RegistrationError(
-            f"{file}: expected {what} with their reasons: {error}; restore it from git"
-        ) from None
+        raise SetError(f"{file}: expected {what} with their reasons: {error}; restore it from git") from None
     return dict(found)
 
 
@@ -251,28 +247,24 @@ def withdraw(folder: FilePath, scenarios: Mapping[str, str]) -> None:
     """Withdraw registered scenarios, with reasons that the page of results shows.
 
     Raises:
-        RegistrationError: A scenario was not registered, has no reason, or already has results: these are published, good or bad.
+        SetError: A scenario was not registered, has no reason, or already has results: these are published, good or bad.
     """
     registration = read_registration(folder)
     if registration is None:
-        raise RegistrationError(
-            f"{folder}: expected {FILE}, which advnerf experiment register writes, got none"
-        )
+        raise SetError(f"{folder}: expected {FILE}, which advnerf experiment register writes, got none")
     names = {cell.scenario for cell in registration.cells}
     for scenario, reason in scenarios.items():
         if scenario not in names:
-            raise RegistrationError(
+            raise SetError(
                 f"expected a registered scenario to withdraw ({', '.join(sorted(names))}), got {scenario!r}"
             )
         if not reason.strip():
-            raise RegistrationError(f"expected a reason for withdrawing {scenario}; give {scenario}=REASON")
+            raise SetError(f"expected a reason for withdrawing {scenario}; give {scenario}=REASON")
         there = [
             cell.name
             for cell in registration.cells
             if cell.scenario == scenario and (folder / f"{cell.name}.json").exists()
         ]
         if there:
-            raise RegistrationError(
-                f"{scenario} cannot be withdrawn, as {there[0]} was published; publish all of it"
-            )
+            raise SetError(f"{scenario} cannot be withdrawn, as {there[0]} was published; publish all of it")
     write_json(folder / WITHDRAWN, {**read_withdrawn(folder), **scenarios})

@@ -15,11 +15,11 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.report.cells import CellError, CellResult
 from advnerf_core.report.evidence.about import check_about
 from advnerf_core.report.evidence.publishing import page_text
-from advnerf_core.report.evidence.registration import RegistrationError, read_withdrawn
+from advnerf_core.report.evidence.registration import SetError, read_withdrawn
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verifying.checks import set_problems
 from advnerf_core.report.evidence.verifying.digests import beside_problems, file_problems, known_digests
-from advnerf_core.report.evidence.verifying.layout import PAGE, SET, SetError, read_set, sets_in
+from advnerf_core.report.evidence.verifying.layout import PAGE, SET, read_set, sets_in
 from advnerf_core.report.evidence.verifying.numbers import number_problems, published_numbers
 from advnerf_core.report.evidence.verifying.registered import missing_cells
 from advnerf_core.report.evidence.verifying.victims import drives_badly, read_declared
@@ -49,7 +49,7 @@ def verify_set(folder: Path) -> Verified:
     try:
         registration, cells = read_set(folder)
         withdrawn, declared = read_withdrawn(folder), read_declared(folder)
-    except (SetError, RegistrationError, CellError) as error:
+    except (SetError, CellError) as error:
         return Verified(folder.name, 0, 0, (str(error),))
     evidence = Evidence(registration, cells)
     try:

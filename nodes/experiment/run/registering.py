@@ -21,7 +21,7 @@ from advnerf_core.report.evidence.registration import (
     PrimaryTest,
     RegisteredScenario,
     Registration,
-    RegistrationError,
+    SetError,
     read_registration,
 )
 from nodes.experiment.plan.carriers import FaceCarrier
@@ -43,7 +43,7 @@ def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> 
     """Write the registration of an experiment into its folder among all published sets.
 
     Raises:
-        RegistrationError: Another registration has this name, cells with these settings were run already, or a test lacks baselines.
+        SetError: Another registration has this name, cells with these settings were run already, or a test lacks baselines.
     """
     found = Registration(
         name=experiment.config.name,
@@ -63,7 +63,7 @@ def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> 
     if before is not None and before.digest == found.digest:
         return before
     if before is not None:
-        raise RegistrationError(
+        raise SetError(
             f"{folder / FILE}: expected the same experiment as was registered on {before.date}, got another; remove the file, and the cells "
             "published beside it, to register anew"
         )
@@ -117,7 +117,7 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
     Baselines are the methods whose textures neither trained nor judged the victim. A place without baselines has no test.
 
     Raises:
-        RegistrationError: A place with a baseline lacks others that a test needs.
+        SetError: A place with a baseline lacks others that a test needs.
     """
     tests = []
     for scenario in dict.fromkeys(cell.scenario for cell in cells):
@@ -131,7 +131,7 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
         families = unseen(RANDOM_FAMILIES, config)
         lacking = lacking_baselines(methods, _coarse_cells_differ(config), families)
         if lacking:
-            raise RegistrationError(
+            raise SetError(
                 f"{scenario}: expected the baselines that a test of the gradient needs, got {', '.join(against)} "
                 f"(textures of {', '.join(trained_on(config, victim))} train the victim, those of {', '.join(VALIDATED_ON)} judge it); add {'; '.join(lacking)} to "
                 "the methods"
@@ -163,7 +163,7 @@ def _refuse_late(experiment: Experiment, cells: Sequence[Cell]) -> None:
         if each.state in (*FINISHED, "begun", "running")
     ]
     if done:
-        raise RegistrationError(
+        raise SetError(
             f"expected to register before anything is run, got {len(done)} cells that are there or begun, such as {done[0]}; "
             "name another run folder, or other seeds"
         )

@@ -6,8 +6,8 @@ import subprocess
 
 import pytest
 
+from advnerf_core.report.evidence.registration import SetError
 from advnerf_core.report.evidence.verifying.history import verify_history
-from advnerf_core.report.evidence.verifying.layout import SetError
 
 GIT = ("git", "-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false")
 REGISTRATION, CELL, FILM = "one/set/registration.json", "one/track_none_0.json", "one_drives.webp"

@@ -10,10 +10,10 @@ from PIL import Image
 
 from advnerf_core.errors import ConfigError
 from advnerf_core.report.cells import read_cells
-from advnerf_core.report.evidence.about import ABOUT, AboutError, check_about, read_about
+from advnerf_core.report.evidence.about import ABOUT, check_about, read_about
 from advnerf_core.report.evidence.above import MOST_BYTES, moment_of, write_above_of, write_maps
 from advnerf_core.report.evidence.page import above_of, film_of, groups_of_searches, searched_apart
-from advnerf_core.report.evidence.registration import PrimaryTest, read_registration
+from advnerf_core.report.evidence.registration import PrimaryTest, SetError, read_registration
 from advnerf_core.report.evidence.results import Evidence, rows
 from advnerf_core.report.evidence.verify import verify_beside, verify_set
 from advnerf_core.report.evidence.verifying.layout import complete_sets, sets_in
@@ -178,10 +178,10 @@ def test_an_entry_for_each_set_is_read_strictly(tmp_path):
     assert verify_set(tmp_path / "simulated").problems == ()  # nothing is said about any set
     entry = {"world": "room", "role": "exploration", "changed": "All."}
     (tmp_path / ABOUT).write_text(json.dumps({"other": entry}))
-    with pytest.raises(AboutError, match="expected an entry for simulated, got none; add world, role"):
+    with pytest.raises(SetError, match="expected an entry for simulated, got none; add world, role"):
         check_about(tmp_path, ["simulated"])
     assert "expected an entry for simulated" in verify_beside(tmp_path)[-1]
-    with pytest.raises(AboutError, match="got other; remove it"):
+    with pytest.raises(SetError, match="got other; remove it"):
         check_about(tmp_path, [])
     for wrong in ({"role": "proof"}, {"world": ""}, {"colour": "red"}, {"object": {"x_m": "1"}}):
         (tmp_path / ABOUT).write_text(json.dumps({"simulated": entry | wrong}))

@@ -17,14 +17,14 @@ from advnerf_core.report.evidence.publishing import write_page
 from advnerf_core.report.evidence.registration import (
     FILE,
     WITHDRAWN,
-    RegistrationError,
+    SetError,
     read_registration,
     withdraw,
 )
 from advnerf_core.report.evidence.results import Evidence, primary_tests, rows
 from advnerf_core.report.evidence.verify import verify_beside, verify_set
 from advnerf_core.report.evidence.verifying.drives import drive_problems
-from advnerf_core.report.evidence.verifying.layout import BESIDE, DIGESTS, PAGE, SET, SetError, sets_in
+from advnerf_core.report.evidence.verifying.layout import BESIDE, DIGESTS, PAGE, SET, sets_in
 from advnerf_core.report.evidence.verifying.pictures import picture_problems
 from advnerf_core.report.evidence.verifying.victims import DECLARED, declare
 from benchmarks.planting.simulated import write_simulated_set
@@ -96,7 +96,7 @@ def test_a_registered_path_that_is_none_is_said_and_ends_nothing(copied, change,
     path = next(iter(data["scenarios"].values()))["path"]
     path["segments"] = change(path["segments"])
     (copied / FILE).write_text(json.dumps(data))
-    with pytest.raises(RegistrationError, match=says):
+    with pytest.raises(SetError, match=says):
         read_registration(copied)
     assert any(says in problem for problem in verify_set(copied).problems)
 
@@ -197,7 +197,7 @@ def test_a_folder_without_registration_is_no_set(tmp_path, copied):
     with pytest.raises(SetError, match="advnerf experiment register"):
         write_set(tmp_path)
     (copied / FILE).write_text("{}")
-    with pytest.raises(RegistrationError, match="restore it from git"):
+    with pytest.raises(SetError, match="restore it from git"):
         read_registration(copied)
     assert "restore it from git" in verify_set(copied).problems[0]
 
@@ -330,7 +330,7 @@ def test_a_scenario_that_was_given_up_is_told_with_its_reason_and_counts_against
     ],
 )
 def test_results_and_strangers_cannot_be_withdrawn(half_run, scenarios, says):
-    with pytest.raises(RegistrationError) as error:
+    with pytest.raises(SetError) as error:
         withdraw(half_run, scenarios)
     assert says in str(error.value)
     assert not (half_run / WITHDRAWN).exists()
@@ -361,7 +361,7 @@ def test_a_victim_that_does_not_drive_well_is_published_only_if_that_is_declared
     weave(folder, 0.2)
     with pytest.raises(SetError, match=r"own\.hardened: does not drive well: mean \|CTE\| 0\.1"):
         write_set(folder)
-    with pytest.raises(RegistrationError, match="expected a reason"):
+    with pytest.raises(SetError, match="expected a reason"):
         declare(folder, {"own.hardened": " "})
     declare(folder, {"own.hardened": "Its car swings by itself."})
     write_set(folder)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from advnerf_core.report.evidence.registration import RegistrationError
+from advnerf_core.report.evidence.registration import SetError
 from nodes.cli.main import app
 from nodes.experiment.engine.artefact import BUILD
 from nodes.experiment.pages.table import write_table
@@ -75,7 +75,7 @@ def test_a_cell_that_was_not_driven_live_is_shown_and_never_published(here, tmp_
         "straight_hardened_gradient_0 is no evidence and is not published: it was not driven live" in output
     )
     assert "2 are not finished" in output
-    with pytest.raises(RegistrationError, match="register before anything is run"):
+    with pytest.raises(SetError, match="register before anything is run"):
         _refuse_late(loaded, loaded.cells)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from advnerf_core.report.evidence.families import coarse_cells_differ
-from advnerf_core.report.evidence.registration import FILE, RegistrationError, read_registration
+from advnerf_core.report.evidence.registration import FILE, SetError, read_registration
 from nodes.experiment.engine.artefact import Settings, write_key
 from nodes.experiment.run.plan import plan_cells, registered_under
 from nodes.experiment.run.registering import primary_tests, register, registered_scenario
@@ -45,7 +45,7 @@ def test_a_registration_says_what_will_be_run(experiment, trained, tmp_path):
     assert (test.method, test.against) == ("gradient", (*FAMILIES, "cem"))
     # Once more it is the same; of another experiment it is refused.
     assert register(experiment, experiment.cells, tmp_path) == found
-    with pytest.raises(RegistrationError, match="remove the file"):
+    with pytest.raises(SetError, match="remove the file"):
         register(experiment, experiment.cells[:5], tmp_path)
 
 
@@ -66,7 +66,7 @@ def test_a_test_needs_three_unseen_families_and_a_coarse_search(trained, tmp_pat
         assert {test.against for test in tests} == ({methods[:-1]} if methods[:-1] else set())
         return
     made = made_of(trained, tmp_path, methods)
-    with pytest.raises(RegistrationError, match="baselines that a test of the gradient needs") as refused:
+    with pytest.raises(SetError, match="baselines that a test of the gradient needs") as refused:
         primary_tests(made, made.cells)
     assert f"add {lacks} to the methods" in str(refused.value)
 
@@ -79,7 +79,7 @@ def test_where_coarse_textures_have_other_cells_the_gradient_is_run_in_both(tmp_
 
     methods = (*FAMILIES, "cem", "gradient")
     assert [test.method for test in on_a_face(0, methods)] == ["gradient"]
-    with pytest.raises(RegistrationError, match="add gradient_coarse, as coarse textures have other cells"):
+    with pytest.raises(SetError, match="add gradient_coarse, as coarse textures have other cells"):
         on_a_face(4, methods)
     fine, coarse = on_a_face(4, (*methods, "gradient_coarse"))
     assert (fine.method, fine.against) == ("gradient", methods[:-1])
@@ -105,7 +105,7 @@ def test_a_registration_after_the_fact_is_refused(experiment, tmp_path):
     work = experiment.folder / "cells" / planned.cell.name
     work.mkdir(parents=True)
     write_key(work / "key.json", planned.settings_hash, Settings.of())
-    with pytest.raises(RegistrationError, match="before anything is run"):
+    with pytest.raises(SetError, match="before anything is run"):
         register(experiment, experiment.cells, tmp_path)
     assert not (tmp_path / "junction" / FILE).exists()
 

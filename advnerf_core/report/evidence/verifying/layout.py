@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from advnerf_core.errors import AdvnerfError
 from advnerf_core.report.cells import CellResult, read_cells
-from advnerf_core.report.evidence.registration import FILE, Registration, read_registration
+from advnerf_core.report.evidence.registration import FILE, Registration, SetError, read_registration
 
 SET, DIGESTS, PAGE, FORMAT = "set/set.json", "sets.json", "transfer.md", "advnerf-set-1"
 # Digests of all other published files: pictures, films, the reference build, sets without a registration.
 BESIDE = "files.json"
-
-
-class SetError(AdvnerfError, ValueError):
-    """A folder is not a set of results."""
 
 
 def sets_in(published: Path) -> list[str]:
@@ -36,8 +31,7 @@ def read_set(folder: Path) -> tuple[Registration, list[CellResult]]:
     """The registration and the cells of a set.
 
     Raises:
-        SetError: The folder has no registration.
-        RegistrationError: The registration is damaged.
+        SetError: The folder has no registration, or it is damaged.
         CellError: A cell is damaged.
     """
     registration = read_registration(folder)

@@ -9,7 +9,7 @@ from typing import Literal
 from pydantic import Field, ValidationError, model_validator
 
 from advnerf_core.documents import read_json
-from advnerf_core.report.evidence.verifying.layout import SetError
+from advnerf_core.report.evidence.registration import SetError
 from advnerf_core.strict import StrictModel
 
 LOG = "removed.json"

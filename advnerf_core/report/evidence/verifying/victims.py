@@ -10,7 +10,7 @@ import numpy as np
 
 from advnerf_core.files import write_json
 from advnerf_core.report.conditions import NONE
-from advnerf_core.report.evidence.registration import RegistrationError, read_reasons, scenario_key
+from advnerf_core.report.evidence.registration import SetError, read_reasons, scenario_key
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.reference import DOMAINS
 
@@ -50,7 +50,7 @@ def read_declared(folder: Path) -> dict[str, str]:
     """Victims of a set that are declared not to drive well, each with the reason for showing them; empty without any.
 
     Raises:
-        RegistrationError: The file is invalid.
+        SetError: The file is invalid.
     """
     return read_reasons(folder / DECLARED, "victims")
 
@@ -59,11 +59,11 @@ def declare(folder: Path, victims: Mapping[str, str]) -> None:
     """Declare that victims do not drive well, with the reason for showing them.
 
     Raises:
-        RegistrationError: A victim has no reason.
+        SetError: A victim has no reason.
     """
     for victim, reason in victims.items():
         if not reason.strip():
-            raise RegistrationError(f"expected a reason for showing {victim}; give {victim}=REASON")
+            raise SetError(f"expected a reason for showing {victim}; give {victim}=REASON")
     write_json(folder / DECLARED, {**read_declared(folder), **victims})
 
 
