@@ -17,14 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.documents import read_json
-from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.prediction_score import (
     LEVEL,
     Score,
     score_bands,
 )
-from advnerf_core.report.evidence.registration import read_registration
-from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.results import Evidence, read_evidence
 from advnerf_core.report.evidence.verifying.layout import complete_sets
 from benchmarks.results import REPOSITORY, LedgerRow
 from benchmarks.transfer_factor import (
@@ -93,9 +91,7 @@ def ledger_rows() -> list[LedgerRow]:
 @cache
 def evidence_of(name: str) -> Evidence:
     """A registered set, read once: its metrics are computed once for the rows of all that ask for it."""
-    registration = read_registration(PUBLISHED / name)
-    assert registration is not None, "sets are found by their registrations"
-    return Evidence(registration, read_cells(PUBLISHED / name))
+    return read_evidence(PUBLISHED / name)
 
 
 def forward(evidence: Evidence, sets: Sequence[Evidence], baseline: bool) -> Predicted | None:

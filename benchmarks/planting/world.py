@@ -20,9 +20,9 @@ from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.publishing import write_page
 from advnerf_core.report.evidence.registration import FILE, Registration, read_withdrawn
-from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.results import read_evidence
 from advnerf_core.report.evidence.verifying.digests import digests_of, write_beside, write_known_digest
-from advnerf_core.report.evidence.verifying.layout import SET, read_set, sets_in
+from advnerf_core.report.evidence.verifying.layout import SET, sets_in
 from advnerf_core.report.evidence.verifying.numbers import published_numbers
 from advnerf_core.report.evidence.verifying.victims import read_declared
 from benchmarks.page_numbers import write_list
@@ -137,7 +137,7 @@ class World:
     def renew_all(self) -> None:
         """Write numbers, page and digests again, with the project's own code."""
         try:
-            evidence = Evidence(*read_set(self.folder))
+            evidence = read_evidence(self.folder)
             numbers = published_numbers(evidence, read_withdrawn(self.folder), read_declared(self.folder))
             self.put(self.folder / SET, {**numbers, "files": {}})
             self.renew_digests()

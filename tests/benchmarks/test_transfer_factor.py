@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.prediction_score import LEVEL, score_bands
-from advnerf_core.report.evidence.registration import read_registration
-from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.results import Evidence, read_evidence
 from benchmarks.planted_changes import write_simulated_set
 from benchmarks.transfer_factor import (
     PRIOR_SPREAD,
@@ -29,7 +27,7 @@ ENDS = np.array([0.1, 0.9])
 def evidence(tmp_path_factory):
     folder = tmp_path_factory.mktemp("published") / "simulated"
     write_simulated_set(folder)
-    return Evidence(read_registration(folder), read_cells(folder))
+    return read_evidence(folder)
 
 
 def simulated(rng, centre=-0.223, spread=0.2, residual=0.1, searches=2, starts=3):

@@ -18,12 +18,11 @@ from PIL import Image
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.report.cells import read_cells
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.about import ObjectPlace, read_about
 from advnerf_core.report.evidence.page import above_of, film_of, searched_apart
-from advnerf_core.report.evidence.registration import PrimaryTest, read_registration
-from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.registration import PrimaryTest
+from advnerf_core.report.evidence.results import Evidence, read_evidence
 from advnerf_core.report.evidence.verifying.layout import SET
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import STYLE
@@ -70,12 +69,12 @@ def write_above_of(folder: Path) -> Path | None:
 
     Of a set whose scenarios share their searches the last one is drawn, with stills of its film; otherwise one map for each.
     """
-    registration, primary = read_registration(folder), read_json(folder / SET)["primary"]
-    if registration is None or not primary:
+    primary = read_json(folder / SET)["primary"]
+    if not primary:
         return None
     about = read_about(folder.parent).get(folder.name)
     film, target = folder.parent / film_of(folder.name), folder.parent / above_of(folder.name)
-    evidence = Evidence(registration, read_cells(folder))
+    evidence = read_evidence(folder)
     shown = searched_apart(primary)
     if len(shown) > 1:
         return write_maps(evidence, shown, target)

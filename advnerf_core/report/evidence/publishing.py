@@ -12,10 +12,10 @@ from advnerf_core.report.evidence.hardness import with_titles
 from advnerf_core.report.evidence.kept_build import lost_note
 from advnerf_core.report.evidence.page import film_of, results_page
 from advnerf_core.report.evidence.registration import SetError, read_registration, read_withdrawn
-from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.results import read_evidence
 from advnerf_core.report.evidence.verifying.checks import set_problems
 from advnerf_core.report.evidence.verifying.digests import digests_of, write_beside, write_known_digest
-from advnerf_core.report.evidence.verifying.layout import PAGE, SET, complete_sets, read_set
+from advnerf_core.report.evidence.verifying.layout import PAGE, SET, complete_sets
 from advnerf_core.report.evidence.verifying.numbers import published_numbers
 from advnerf_core.report.evidence.verifying.pictures import write_picture
 from advnerf_core.report.evidence.verifying.victims import read_declared
@@ -28,13 +28,8 @@ def write_numbers(folder: Path) -> Path:
         SetError: The folder has no registration, its cells contradict it, or a victim does not drive well and that is not
             declared.
     """
-    registration, cells = read_set(folder)
-    evidence, withdrawn, declared = (
-        Evidence(registration, cells),
-        read_withdrawn(folder),
-        read_declared(folder),
-    )
-    problems = list(set_problems(folder, evidence, cells))
+    evidence, withdrawn, declared = read_evidence(folder), read_withdrawn(folder), read_declared(folder)
+    problems = list(set_problems(folder, evidence))
     if problems:
         raise SetError(f"{folder}: cannot be published: {problems[0]} ({len(problems)} problems in all)")
     numbers = published_numbers(evidence, withdrawn, declared)

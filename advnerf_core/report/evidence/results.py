@@ -4,22 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.driving.metrics import DriveMetrics
-from advnerf_core.report.cells import CellResult
+from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.conditions import CONTROLS, NONE
 from advnerf_core.report.evidence.anytime import AnytimeTest, anytime_test
 from advnerf_core.report.evidence.exact import McNemar, holm, mcnemar_per_search, permutation_test
 from advnerf_core.report.evidence.intervals import ClusteredInterval, difference_interval
 from advnerf_core.report.evidence.outcome import Outcome, drive_outcome
 from advnerf_core.report.evidence.registration import (
+    FILE,
     PrimaryTest,
     RegisteredScenario,
     Registration,
+    SetError,
+    read_registration,
     scenario_key,
 )
 from advnerf_core.report.evidence.rows import CellDrives, Key, Row, make_row
@@ -82,7 +86,7 @@ class TestResult:
 class Evidence(CellDrives):
     """Outcomes of all drives of a registered set.
 
-    Cells without published drives, not driven live, or of an unregistered scenario, are left out.
+    Cells without published drives, not driven live, or of an unregistered scenario, are left out; ``all_cells`` has them too.
     """
 
     def __init__(self, registration: Registration, cells: Sequence[CellResult]) -> None:
@@ -93,6 +97,7 @@ class Evidence(CellDrives):
             and not cell.not_driven_live
             and registration.scenario(cell.scenario, cell.placement) is not None
         )
+        self.all_cells = tuple(cells)
         self.registration, self.level = registration, registration.level
         self._named, self._digest = {cell.name for cell in registration.cells}, registration.digest
         self._paths = {name: each.reference_path() for name, each in registration.scenarios.items()}
@@ -146,6 +151,19 @@ class Evidence(CellDrives):
             drive_outcome(attacked.ctes_m, none.ctes_m, horizon, drive.obstacle)
             for attacked, none, drive in pairs
         ]
+
+
+def read_evidence(folder: Path) -> Evidence:
+    """The evidence of a set in its folder.
+
+    Raises:
+        SetError: The folder has no registration, or it is damaged.
+        CellError: A cell is damaged.
+    """
+    registration = read_registration(folder)
+    if registration is None:
+        raise SetError(f"{folder}: expected {FILE}, which advnerf experiment register writes, got none")
+    return Evidence(registration, read_cells(folder))
 
 
 def rows(evidence: Evidence) -> list[Row]:

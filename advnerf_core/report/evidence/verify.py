@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.report.cells import CellError, CellResult
+from advnerf_core.report.cells import CellError
 from advnerf_core.report.evidence.about import check_about
 from advnerf_core.report.evidence.publishing import page_text
 from advnerf_core.report.evidence.registration import SetError, read_withdrawn
-from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.results import Evidence, read_evidence
 from advnerf_core.report.evidence.verifying.checks import set_problems
 from advnerf_core.report.evidence.verifying.digests import beside_problems, file_problems, known_digests
-from advnerf_core.report.evidence.verifying.layout import PAGE, SET, read_set, sets_in
+from advnerf_core.report.evidence.verifying.layout import PAGE, SET, sets_in
 from advnerf_core.report.evidence.verifying.numbers import number_problems, published_numbers
 from advnerf_core.report.evidence.verifying.registered import missing_cells
 from advnerf_core.report.evidence.verifying.victims import drives_badly, read_declared
@@ -47,18 +47,17 @@ class Verified:
 def verify_set(folder: Path) -> Verified:
     """Recompute everything in a set, and compare."""
     try:
-        registration, cells = read_set(folder)
+        evidence = read_evidence(folder)
         withdrawn, declared = read_withdrawn(folder), read_declared(folder)
     except (SetError, CellError) as error:
         return Verified(folder.name, 0, 0, (str(error),))
-    evidence = Evidence(registration, cells)
     try:
-        missing = len(missing_cells(evidence, cells, withdrawn))
+        missing = len(missing_cells(evidence, withdrawn))
         if missing and not (folder / SET).exists() and folder.name not in known_digests(folder.parent):
             # No number is claimed, but the cells that are there must be right.
-            problems = tuple(set_problems(folder, evidence, cells, under_way=True))
-            return Verified(folder.name, 0, _drives(cells), problems, awaits=missing)
-        return _verified(folder, evidence, cells, withdrawn, declared)
+            problems = tuple(set_problems(folder, evidence, under_way=True))
+            return Verified(folder.name, 0, _drives(evidence), problems, awaits=missing)
+        return _verified(folder, evidence, withdrawn, declared)
     except (
         ValueError,
         LookupError,
@@ -70,23 +69,22 @@ def verify_set(folder: Path) -> Verified:
         )
 
 
-def _drives(cells: Sequence[CellResult]) -> int:
-    return sum(len(kept) for cell in cells for kept in cell.kept.values())
+def _drives(evidence: Evidence) -> int:
+    return sum(len(kept) for cell in evidence.all_cells for kept in cell.kept.values())
 
 
 def _verified(
     folder: Path,
     evidence: Evidence,
-    cells: Sequence[CellResult],
     withdrawn: Mapping[str, str],
     declared: Mapping[str, str],
 ) -> Verified:
-    problems = [*file_problems(folder), *set_problems(folder, evidence, cells)]
+    problems = [*file_problems(folder), *set_problems(folder, evidence)]
     numbers = 0
     if not problems:  # numbers of damaged drives add nothing
         numbers, problems = number_problems(folder, published_numbers(evidence, withdrawn, declared))
     return Verified(
-        folder.name, numbers, _drives(cells), tuple(problems), tuple(_findings(evidence, problems))
+        folder.name, numbers, _drives(evidence), tuple(problems), tuple(_findings(evidence, problems))
     )
 
 

@@ -12,12 +12,10 @@ from PIL import Image
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.report.cells import read_cells
 from advnerf_core.report.clips import read_clip, webp
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.page import film_of
-from advnerf_core.report.evidence.registration import read_registration
-from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.results import read_evidence
 from advnerf_core.report.evidence.verifying.layout import SET
 from nodes.experiment.show.context import Experiment
 
@@ -43,9 +41,7 @@ def write_film(experiment: Experiment, published: Path) -> Path | None:
 
 
 def _clips(experiment: Experiment, published: Path, test: dict[str, Any]) -> list[Path]:
-    which, registration = test["test"], read_registration(published)
-    assert registration is not None, "a set was registered"
-    evidence = Evidence(registration, read_cells(published))
+    which, evidence = test["test"], read_evidence(published)
     searched = [
         evidence.searches((which["scenario"], which["placement"], which["victim"], method))[0]
         for method in (NONE, test["baseline"], which["method"])

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.families import families_note, lacking_baselines
 from advnerf_core.report.evidence.kept_build import LOST, is_kept, lost_note
 from advnerf_core.report.evidence.registration import PrimaryTest, RegisteredCell, read_registration
-from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.results import read_evidence
 from benchmarks.strongest import strongest_random
 
 PUBLISHED = Path(__file__).parents[3] / "docs" / "results"
@@ -68,7 +67,7 @@ def test_sets_whose_weights_are_lost_say_so(name):
 
 def test_the_best_random_search_is_a_maximum_over_searches():
     (found,) = strongest_random(PUBLISHED / "room")
-    evidence = Evidence(read_registration(PUBLISHED / "room"), read_cells(PUBLISHED / "room"))
+    evidence = read_evidence(PUBLISHED / "room")
     # By hand, from poses alone: total CTE of each drive minus that without attack from the same start, per tick.
     path, ticks = evidence.registration.scenarios["track"].reference_path(), 60
     none = evidence.cells["track_hardened_none_0"].kept["deployed"]

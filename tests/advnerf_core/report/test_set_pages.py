@@ -13,8 +13,8 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.about import ABOUT, check_about, read_about
 from advnerf_core.report.evidence.above import MOST_BYTES, moment_of, write_above_of, write_maps
 from advnerf_core.report.evidence.page import above_of, film_of, groups_of_searches, searched_apart
-from advnerf_core.report.evidence.registration import PrimaryTest, SetError, read_registration
-from advnerf_core.report.evidence.results import Evidence, rows
+from advnerf_core.report.evidence.registration import PrimaryTest, SetError
+from advnerf_core.report.evidence.results import read_evidence, rows
 from advnerf_core.report.evidence.verify import verify_beside, verify_set
 from advnerf_core.report.evidence.verifying.layout import complete_sets, sets_in
 from advnerf_core.report.evidence.words import claim, excesses, p_text, smaller_excess
@@ -95,7 +95,7 @@ def test_sets_that_share_searches_are_one_group_and_the_page_says_so():
 
 def test_excess_over_no_object_is_that_over_the_plain_object_and_that_of_the_plain_object():
     name = "gap_metadrive"
-    evidence = Evidence(read_registration(PUBLISHED / name), read_cells(PUBLISHED / name))
+    evidence = read_evidence(PUBLISHED / name)
     found = {(row.scenario, row.method, row.domain): row for row in rows(evidence)}
     for (scenario, method, domain), row in found.items():
         if method in ("none", "empty"):
@@ -193,7 +193,7 @@ def test_an_entry_for_each_set_is_read_strictly(tmp_path):
 def test_the_moment_of_the_stills_is_that_of_the_kept_poses():
     name = "gap_duckietown_robust"
     folder = PUBLISHED / name
-    evidence = Evidence(read_registration(folder), read_cells(folder))
+    evidence = read_evidence(folder)
     registered = evidence.registration.scenarios["more"]
     test = next(each for each in evidence.registration.primary if each.scenario == "more")
     drive = evidence.cells["more_hardened_gradient_6"].kept["deployed"][0]
@@ -215,7 +215,7 @@ def test_a_set_without_a_film_and_a_known_object_has_its_drives_from_above(tmp_p
 
 def test_scenarios_with_searches_of_their_own_have_a_map_each(tmp_path):
     folder = PUBLISHED / "paper_car"
-    evidence = Evidence(read_registration(folder), read_cells(folder))
+    evidence = read_evidence(folder)
     shown = searched_apart(published("paper_car")["primary"])
     picture = np.asarray(Image.open(write_maps(evidence, shown, tmp_path / "maps.webp")).convert("RGB"))
     halves = np.split(picture.astype(int), 2, axis=1)

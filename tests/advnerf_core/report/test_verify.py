@@ -21,7 +21,7 @@ from advnerf_core.report.evidence.registration import (
     read_registration,
     withdraw,
 )
-from advnerf_core.report.evidence.results import Evidence, primary_tests, rows
+from advnerf_core.report.evidence.results import Evidence, primary_tests, read_evidence, rows
 from advnerf_core.report.evidence.verify import verify_beside, verify_set
 from advnerf_core.report.evidence.verifying.drives import drive_problems
 from advnerf_core.report.evidence.verifying.layout import BESIDE, DIGESTS, PAGE, SET, sets_in
@@ -46,7 +46,7 @@ def copied(original, tmp_path):
 
 
 def evidence_of(folder):
-    return Evidence(read_registration(folder), read_cells(folder))
+    return read_evidence(folder)
 
 
 def test_a_set_as_it_was_published_has_no_problem(original):

@@ -6,7 +6,7 @@ verdicts are consistent with the cells and with themselves.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,12 @@ _PREDICTIONS = ("predictions", "predictions_afterwards")
 _CORRELATIONS = ("correlation", "ssim")
 
 
-def set_problems(
-    folder: Path, evidence: Evidence, cells: Sequence[CellResult], under_way: bool = False
-) -> Iterator[str]:
+def set_problems(folder: Path, evidence: Evidence, under_way: bool = False) -> Iterator[str]:
     """Problems of the cells of a set and of the files beside them; while it is under way, cells may be missing."""
     damaged, withdrawn = under_way, read_withdrawn(folder)
-    missing = [] if under_way else missing_cells(evidence, cells, withdrawn)
+    missing = [] if under_way else missing_cells(evidence, withdrawn)
     absent = (f"{name}: was registered, and is not there" for name in missing)
-    for check in (absent, cell_problems(evidence, cells, withdrawn), drive_problems(evidence)):
+    for check in (absent, cell_problems(evidence, withdrawn), drive_problems(evidence)):
         for problem in check:
             damaged = True
             yield problem

@@ -1,11 +1,10 @@
-"""Locations of the files of published sets, and how a set is read."""
+"""Locations of the files of published sets."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from advnerf_core.report.cells import CellResult, read_cells
-from advnerf_core.report.evidence.registration import FILE, Registration, SetError, read_registration
+from advnerf_core.report.evidence.registration import FILE
 
 SET, DIGESTS, PAGE, FORMAT = "set/set.json", "sets.json", "transfer.md", "advnerf-set-1"
 # Digests of all other published files: pictures, films, the reference build, sets without a registration.
@@ -25,16 +24,3 @@ def complete_sets(published: Path) -> list[str]:
 def cell_files(folder: Path) -> list[Path]:
     """Files of the cells of a set, by name."""
     return sorted(folder.glob("*.json"))
-
-
-def read_set(folder: Path) -> tuple[Registration, list[CellResult]]:
-    """The registration and the cells of a set.
-
-    Raises:
-        SetError: The folder has no registration, or it is damaged.
-        CellError: A cell is damaged.
-    """
-    registration = read_registration(folder)
-    if registration is None:
-        raise SetError(f"{folder}: expected {FILE}, which advnerf experiment register writes, got none")
-    return registration, read_cells(folder)

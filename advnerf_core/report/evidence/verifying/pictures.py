@@ -13,8 +13,8 @@ from PIL import Image, UnidentifiedImageError
 from advnerf_core.documents import read_json
 from advnerf_core.report.evidence.hardness import titles_of
 from advnerf_core.report.evidence.page import picture_of
-from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.evidence.verifying.layout import SET, read_set
+from advnerf_core.report.evidence.results import Evidence, read_evidence
+from advnerf_core.report.evidence.verifying.layout import SET
 
 DPI = 110
 # Another version of matplotlib or of its fonts moves letters by a pixel; a moved point or bar is darker.
@@ -41,9 +41,8 @@ def picture_problems(folder: Path) -> Iterator[str]:
     except (OSError, UnidentifiedImageError) as error:
         yield f"{file}: cannot be read: {error}"
         return
-    registration, cells = read_set(folder)
     with TemporaryDirectory() as work:
-        drawn = _pixels(write_picture(Evidence(registration, cells), folder, Path(work)))
+        drawn = _pixels(write_picture(read_evidence(folder), folder, Path(work)))
     if published.shape != drawn.shape:
         yield f"{file}: expected {drawn.shape[1]} x {drawn.shape[0]} pixels as its drives give, got {published.shape[1]} x {published.shape[0]}"
     elif (largest := float(np.abs(_blocks(published) - _blocks(drawn)).max())) > _LARGEST:

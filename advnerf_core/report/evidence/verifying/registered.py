@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from datetime import datetime
 
 from advnerf_core.report.cells import CellResult
@@ -10,18 +10,16 @@ from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.evidence.results import Evidence
 
 
-def missing_cells(evidence: Evidence, cells: Sequence[CellResult], withdrawn: Collection[str]) -> list[str]:
+def missing_cells(evidence: Evidence, withdrawn: Collection[str]) -> list[str]:
     """Registered cells that are not there, though their scenario was not withdrawn."""
-    there = {cell.name for cell in cells}
+    there = {cell.name for cell in evidence.all_cells}
     registered = (each for each in evidence.registration.cells if each.scenario not in withdrawn)
     return [each.name for each in registered if each.name not in there]
 
 
-def cell_problems(
-    evidence: Evidence, cells: Sequence[CellResult], withdrawn: Collection[str]
-) -> Iterator[str]:
+def cell_problems(evidence: Evidence, withdrawn: Collection[str]) -> Iterator[str]:
     """Whether no cell passes for registered that is not, and none is of a withdrawn scenario."""
-    there = {cell.name for cell in cells}
+    there = {cell.name for cell in evidence.all_cells}
     for wanted in evidence.registration.cells:
         name = wanted.name
         if wanted.scenario in withdrawn:
@@ -29,7 +27,7 @@ def cell_problems(
                 yield f"{name}: is there, and its scenario was withdrawn"
         elif name in evidence.cells and not evidence.is_registered(evidence.cells[name]):
             yield f"{name}: was registered, and was not run under this registration"
-    for cell in cells:
+    for cell in evidence.all_cells:
         if cell.not_driven_live:
             yield f"{cell.name}: was not driven live and is no evidence: {cell.not_driven_live}"
         elif cell.name not in evidence.cells:
