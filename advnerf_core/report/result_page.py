@@ -8,9 +8,10 @@ import csv
 import io
 import os
 import shutil
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from markupsafe import Markup
@@ -51,21 +52,9 @@ LEGEND = (
 )
 
 
-@dataclass(frozen=True)
-class ShownClip:
-    """A clip of a cell with one of `OUTCOMES`; its file is relative to the page."""
-
-    cell: CellResult
-    outcome: str
-    file: str
-
-    @property
-    def caption(self) -> str:
-        """Caption of the clip."""
-        drives = self.cell.deployed or self.cell.surrogate
-        return (
-            f"total CTE {sum(drives.total_cte_m):.2f} m, without attack {sum(drives.none_total_cte_m):.2f} m"
-        )
+Clips = Mapping[
+    str, Mapping[str, CellResult]
+]  # cells by outcome and by the clip's file, relative to the page
 
 
 def outcome_of(cell: CellResult) -> str:
@@ -151,12 +140,10 @@ def as_json(table: ResultTable, targets: Sequence[Target] = ()) -> dict[str, Any
 def as_csv(table: ResultTable) -> str:
     """The lines, one column per number; missing numbers are empty."""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    records = [row.record() for row in table.rows]
-    columns = list(records[0] if records else {})
-    writer.writerow(columns)
-    for record in records:
-        writer.writerow([_field(record[name]) for name in columns])
+    records = [{name: _field(value) for name, value in row.record().items()} for row in table.rows]
+    writer = csv.DictWriter(stream, records[0] if records else (), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(records)
     return stream.getvalue()
 
 
@@ -176,13 +163,13 @@ def as_markdown(table: ResultTable, targets: Sequence[Target] = ()) -> str:
     return "\n".join(parts)
 
 
-def gather_clips(table: ResultTable, cells_folder: Path, page_folder: Path) -> list[ShownClip]:
+def gather_clips(table: ResultTable, cells_folder: Path, page_folder: Path) -> Clips:
     """Put the cells' clips beside the page, in one folder per outcome; as hard links if the disk has the file.
 
     The clips' names are relative to the folder of the cells. Older clips beside the page are deleted.
     """
     shutil.rmtree(page_folder / "videos", ignore_errors=True)
-    shown = []
+    shown: dict[str, dict[str, CellResult]] = {name: {} for name in OUTCOMES}
     for name, cell in table.cells.items():
         clip = cell.extra.get("clip")
         source = cells_folder / clip if isinstance(clip, str) else None
@@ -195,14 +182,14 @@ def gather_clips(table: ResultTable, cells_folder: Path, page_folder: Path) -> l
             os.link(source, target)
         except OSError:
             shutil.copyfile(source, target)
-        shown.append(ShownClip(cell, outcome, target.relative_to(page_folder).as_posix()))
-    return shown
+        shown[outcome][target.relative_to(page_folder).as_posix()] = cell
+    return {outcome: found for outcome, found in shown.items() if found}
 
 
 def render_page(
     table: ResultTable,
     first: FirstScreen,
-    clips: Sequence[ShownClip] = (),
+    clips: Clips = MappingProxyType({}),
     sections: Sequence[tuple[str, Markup]] = (),
     targets: Sequence[Target] = (),
     notes: Sequence[str] = (),
@@ -211,9 +198,7 @@ def render_page(
 
     Its notes are what a reader must know first, such as what is left out.
     """
-    of = {name: [clip for clip in clips if clip.outcome == name] for name in OUTCOMES}
-    groups = [(name, _EXPLAINED[name], found) for name, found in of.items() if found]
-    parts = fragments("results.html", groups=groups)
+    parts = fragments("results.html", clips=clips, explained=_EXPLAINED)
     shown = Markup(parts.table(text_table(table).html(), LEGEND, ratios(table)))
     made = [("Results in metres", shown)]
     if targets:

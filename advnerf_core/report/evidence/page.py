@@ -85,19 +85,18 @@ def _overview(sets: Mapping[str, Mapping[str, Any]]) -> list[str]:
     if not said:
         return []
     count, worlds = len(groups_of_searches(sets)), len({about["world"] for about in said.values()})
-    columns = ("set", "world", "role", "searches", "shares searches with")
-    rows = tuple(
-        (
-            f"[{name}](#{name})",
-            about["world"],
-            about["role"],
-            str(len(sets[name]["searches"])),
-            _shared(name, sets),
-        )
+    lines = [
+        {
+            "set": f"[{name}](#{name})",
+            "world": about["world"],
+            "role": about["role"],
+            "searches": str(len(sets[name]["searches"])),
+            "shares searches with": _shared(name, sets),
+        }
         for name, about in sorted(said.items())
-    )
+    ]
     sentence = f"The {len(sets)} sets are {count} groups of searches in {worlds} worlds. Sets that share searches are not independent.\n"
-    return [sentence, _markdown(columns, rows)]
+    return [sentence, _lines(lines)]
 
 
 def _shared(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
@@ -310,7 +309,8 @@ def _lines(lines: Sequence[Mapping[str, str]]) -> str:
         for name in (lines[0] if lines else {})
         if name not in _OPTIONAL or len({line[name] for line in lines}) > 1
     )
-    return _markdown(columns, tuple(tuple(line[name] for name in columns) for line in lines))
+    cells = tuple(tuple(line[name] for name in columns) for line in lines)
+    return Table("", columns, cells, (False,) * len(columns), drops_empty=False).markdown()
 
 
 def _cells(row: Mapping[str, Any]) -> dict[str, str]:
@@ -330,10 +330,6 @@ def _cells(row: Mapping[str, Any]) -> dict[str, str]:
         "ticks off lane": f"{100 * row['off_lane_share']:.0f} %",
         "leaves after [s]": "" if row["leaving_s"] is None else f"{row['leaving_s']:.1f}",
     }
-
-
-def _markdown(columns: tuple[str, ...], rows: tuple[tuple[str, ...], ...]) -> str:
-    return Table("", columns, rows, (False,) * len(columns), drops_empty=False).markdown()
 
 
 def _commands(name: str, registration: Mapping[str, Any]) -> str:

@@ -224,11 +224,14 @@ def test_clips_are_grouped_by_outcome(tmp_path):
         (tmp_path / "cells" / name / "clip.mp4").write_bytes(name.encode())
     cells = [strayed, left, gone, held]
     shown = gather_clips(make_table(wanted_of(cells), cells), tmp_path / "cells", tmp_path / "page")
-    assert {clip.file for clip in shown} == {
-        "videos/strayed/straight_hardened_gradient_0.mp4",
-        "videos/left_the_track/left_hardened_gradient_0.mp4",
+    assert shown == {
+        "left the track": {"videos/left_the_track/left_hardened_gradient_0.mp4": left},
+        "strayed": {"videos/strayed/straight_hardened_gradient_0.mp4": strayed},
     }
-    assert all((tmp_path / "page" / clip.file).is_file() for clip in shown)
+    assert all((tmp_path / "page" / file).is_file() for found in shown.values() for file in found)
+    page = render_page(make_table(wanted_of(cells), cells), FIRST, shown)
+    assert "<h3>Left the track (1)</h3>" in page
+    assert "seed 0: total CTE 3.00 m, without attack 1.00 m" in page
 
 
 @pytest.mark.parametrize(
