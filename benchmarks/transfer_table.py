@@ -65,6 +65,11 @@ def line_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     return "" + ", ".join(filter(None, [*parts, "" if row.victim == VICTIM else f"{row.victim} victim"]))
 
 
+def cells_of(table: ResultTable, row: TableRow) -> list[CellResult]:
+    """The cells that a line of a table summarises."""
+    return [cell for cell in table.cells.values() if cell.key == row.key]
+
+
 def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     """What readers must know of a row."""
     spread = "" if row.total_std_m is None else f" +- {row.total_std_m:.2f}"
@@ -254,7 +259,7 @@ def ledger_rows(file: Path, folder: Path | None = None) -> list[LedgerRow]:
     table, run = published_table(folder, experiment), f"advnerf experiment {file}"
     limits, found = experiment.held_to.targets, []
     for row, said, target in rows_of(table, limits):
-        cells = table.cells_of(row)
+        cells = cells_of(table, row)
         note = note_of(row, cells) + why_missed(target, row, cells)
         note += how_far(cells) if row.domain == "deployed" else ""
         limit, met = (f"{said} x", target.met) if target else ("", None)
@@ -279,7 +284,7 @@ def _other_targets(table: ResultTable, limits: Sequence[Limit], run: str) -> lis
         row = table.find(limit.scenario, limit.victim, limit.method, limit.domain)
         if limit.of == "ratio" or row is None or target is None or target.value is None:
             continue
-        measure, cells = _MEASURES[limit.of], table.cells_of(row)
+        measure, cells = _MEASURES[limit.of], cells_of(table, row)
         line = f"{limit.scenario}, {style_of(limit.method).title}, {limit.domain}: {measure}"
         note = f"{len(row.seeds)} seeds" + (how_far(cells) if "off the track" in measure else "")
         note += why_missed(target, row, cells)

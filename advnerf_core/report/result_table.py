@@ -75,10 +75,6 @@ class ResultTable:
         key = (scenario, "", victim, method)
         return next((row for row in self.rows if row.key == key and row.domain == domain), None)
 
-    def cells_of(self, row: TableRow) -> list[CellResult]:
-        """The cells that a line summarises."""
-        return [cell for cell in self.cells.values() if cell.key == row.key]
-
 
 def make_table(
     wanted: Mapping[Key, Sequence[int]],

@@ -77,7 +77,7 @@ def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
         ("surrogate", 4.5, None),
         ("deployed", 4.5, None),
     ]
-    note = transfer_table.note_of(rows[0][0], table.cells_of(rows[0][0]))
+    note = transfer_table.note_of(rows[0][0], transfer_table.cells_of(table, rows[0][0]))
     assert "seeds 2 are missing" in note
     assert transfer_table.measured_where(cells) == {"machine": "machine 0; machine 1", "date": "2026-11-21"}
     assert "total CTE 9.00 +- 0.00 m of 2.00 m" in note
@@ -99,7 +99,7 @@ def test_a_miss_says_by_how_much_and_what_that_is_on_the_road():
     table = make_table({("right", "", "hardened", method): (0, 1) for method in ("none", "random")}, cells)
     rows = dict((row.domain, (row, target)) for row, _, target in rows_of(table))
     row, target = rows["deployed"]
-    why = transfer_table.why_missed(target, row, table.cells_of(row))
+    why = transfer_table.why_missed(target, row, transfer_table.cells_of(table, row))
     assert "missed by 25 %: 50 mm off the path on average, 33 mm without attack" in why
     assert transfer_table.why_missed(None, row, []) == ""
 
