@@ -13,10 +13,9 @@ from advnerf_core.driving.metrics import mean_cte_limit_m
 from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.conditions import CONTROLS, style_of
 from advnerf_core.report.evidence.families import COARSE_SEARCHES, RANDOM_FAMILIES
-from advnerf_core.report.evidence.outcome import Outcome
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.evidence.rows import Key
+from advnerf_core.report.evidence.rows import Key, Outcome
 from advnerf_core.report.reference import DOMAINS
 from nodes.experiment.plan.victims import NAIVE
 

@@ -130,11 +130,11 @@ def write_above(
 def moment_of(evidence: Evidence, test: PrimaryTest) -> tuple[float, bool]:
     """Time [s] at which the first deployed drive of the first search leaves the track, or deviates most; and whether it left."""
     cell = evidence.searches((test.scenario, test.placement, test.victim, test.method))[0]
-    horizon = evidence.scenario_of(cell).horizon
-    deviation = np.abs(evidence.metrics(cell, "deployed")[0].ctes_m)
-    off = deviation > horizon.off_track_m
-    left = bool(off.any())
-    return float((off.argmax() if left else deviation.argmax()) + 1) * horizon.dt_s, left
+    metrics = evidence.metrics(cell, "deployed")[0]
+    if metrics.time_to_leaving_s is not None:
+        return metrics.time_to_leaving_s, True
+    largest = int(np.abs(metrics.ctes_m).argmax())
+    return (largest + 1) * evidence.scenario_of(cell).dt_s, False
 
 
 def _groups(evidence: Evidence, test: PrimaryTest, baseline: str) -> list[_Group]:

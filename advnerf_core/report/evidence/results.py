@@ -16,7 +16,6 @@ from advnerf_core.report.conditions import CONTROLS, NONE
 from advnerf_core.report.evidence.anytime import AnytimeTest, anytime_test
 from advnerf_core.report.evidence.exact import McNemar, holm, mcnemar_per_search, permutation_test
 from advnerf_core.report.evidence.intervals import ClusteredInterval, difference_interval
-from advnerf_core.report.evidence.outcome import Outcome, drive_outcome
 from advnerf_core.report.evidence.registration import (
     FILE,
     PrimaryTest,
@@ -26,7 +25,7 @@ from advnerf_core.report.evidence.registration import (
     read_registration,
     scenario_key,
 )
-from advnerf_core.report.evidence.rows import CellDrives, Key, Row, make_row
+from advnerf_core.report.evidence.rows import CellDrives, Key, Outcome, Row, make_row
 from advnerf_core.report.reference import DOMAINS, Domain
 
 Floats = NDArray[np.float64]
@@ -147,10 +146,7 @@ class Evidence(CellDrives):
             cell.kept.get(domain, ()),
             strict=False,
         )
-        return [
-            drive_outcome(attacked.ctes_m, none.ctes_m, horizon, drive.obstacle)
-            for attacked, none, drive in pairs
-        ]
+        return [Outcome.of(attacked, none, horizon, drive.obstacle) for attacked, none, drive in pairs]
 
 
 def read_evidence(folder: Path) -> Evidence:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from advnerf_core.driving.metrics import DriveMetrics, Horizon
 from advnerf_core.report.cells import CellResult, cell_name
 from advnerf_core.report.conditions import EMPTY, NONE
 from advnerf_core.report.evidence.intervals import LEVEL, ClusteredInterval, clustered_interval
-from advnerf_core.report.evidence.outcome import Outcome
 from advnerf_core.report.reference import Domain
 
 Key = tuple[str, str, str, str]  # scenario, placement, victim, method
@@ -66,6 +66,38 @@ class Row(RowOf):
     off_lane_share: float | None
     leaving_s: float | None
     registered: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Effect of an attack on one drive.
+
+    Attributes:
+        excess_cte_m_per_tick: Mean |CTE| of the attacked drive minus that of the control's drive from the same start [m].
+        off_track: Whether |CTE| of the attacked drive ever exceeded the off-track limit.
+        collided_with: Name of the obstacle that the attacked car hit; None without a collision.
+        time_to_leaving_s: Time of the first tick off the track [s]; None if the car never left it, or if only totals are stored.
+        share_off_lane: Share of the ticks off the track, within 0..1; None if only totals are stored.
+    """
+
+    excess_cte_m_per_tick: float
+    off_track: bool
+    collided_with: str | None
+    time_to_leaving_s: float | None
+    share_off_lane: float | None
+
+    @classmethod
+    def of(
+        cls, attacked: DriveMetrics, control: DriveMetrics, horizon: Horizon, collided_with: str | None
+    ) -> Outcome:
+        """Compare an attacked drive with the control's drive from the same start, both measured over the horizon."""
+        return cls(
+            (attacked.total_cte_m - control.total_cte_m) / horizon.ticks,
+            attacked.off_track,
+            collided_with,
+            attacked.time_to_leaving_s,
+            float((np.abs(attacked.ctes_m) > horizon.off_track_m).mean()),
+        )
 
 
 class CellDrives:
