@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from advnerf_core.documents import read_json
-from advnerf_core.files import sha256_of, write_atomically
+from advnerf_core.files import sha256_of, write_json
 from advnerf_core.report.evidence.verifying.layout import BESIDE, DIGESTS, SET, sets_in
 
 # Its pages are recomputed from the listed files, and the log of removals only ever grows.
@@ -42,12 +41,12 @@ def write_known_digest(folder: Path) -> None:
     """Write the digest of a set's manifest beside the folders of all sets."""
     known = known_digests(folder.parent)
     known[folder.name] = sha256_of(folder / SET)
-    _write(folder.parent / DIGESTS, known)
+    write_json(folder.parent / DIGESTS, dict(sorted(known.items())))
 
 
 def write_beside(published: Path) -> None:
     """Write the manifest of every file that belongs to no registered set."""
-    _write(published / BESIDE, digests_beside(published))
+    write_json(published / BESIDE, dict(sorted(digests_beside(published).items())))
 
 
 def file_problems(folder: Path) -> Iterator[str]:
@@ -93,7 +92,3 @@ def _digests(folder: Path, listed: Callable[[str], bool]) -> dict[str, str]:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     names = ((file.relative_to(folder).as_posix(), file) for file in files)
     return {name: sha256_of(file) for name, file in names if listed(name)}
-
-
-def _write(file: Path, digests: Mapping[str, str]) -> None:
-    write_atomically(file, json.dumps(digests, indent=1, sort_keys=True) + "\n")

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from advnerf_core.geometry import wrap_angle
 from advnerf_core.report.cells import CellResult
-from advnerf_core.report.evidence.kept import Floats, KeptDrive
+from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.registration import RegisteredScenario
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.reference import DOMAINS, Domain
@@ -84,7 +85,7 @@ def _starts(
         if len(poses) != scenario.ticks + 1 or drive.driven_ticks > scenario.ticks:
             yield f"{where}, start {number}: expected {scenario.ticks + 1} poses, got {len(poses)}"
         off_m = float(np.hypot(*(poses[0, :2] - start[:2])))
-        turned_rad = abs(float(_turned(poses[0, 2] - start[2])))
+        turned_rad = abs(float(wrap_angle(poses[0, 2] - start[2])))
         if off_m > near_m or turned_rad > near_rad:
             yield f"{where}, start {number}: begins {off_m:.3f} m and {turned_rad:.3f} rad from the registered start"
 
@@ -109,18 +110,13 @@ def _able(clean: CellResult, domain: Domain) -> Motion:
 def _moved(drive: KeptDrive, longest_m: float) -> Motion:
     """The longest step of a drive until it stopped, and the largest slip of its steps that are a fifth of ``longest_m`` or more."""
     poses = drive.poses()[: drive.driven_ticks + 1]
-    steps, turned = np.diff(poses[:, :2], axis=0), _turned(np.diff(poses[:, 2]))
+    steps, turned = np.diff(poses[:, :2], axis=0), wrap_angle(np.diff(poses[:, 2]))
     lengths_m = np.hypot(*steps.T)
     heading = poses[:-1, 2] + turned / 2.0
     sideways_m = np.abs(steps[:, 1] * np.cos(heading) - steps[:, 0] * np.sin(heading))
     moving = lengths_m > max(_MOVING * longest_m, _ROUNDING_M)
     slip = np.maximum(sideways_m - _ROUNDING_M, 0.0)[moving] / lengths_m[moving]
     return Motion(float(lengths_m.max(initial=0.0)), float(slip.max(initial=0.0)))
-
-
-def _turned(angles: Floats) -> Floats:
-    """Angles within -pi and pi."""
-    return np.asarray(np.angle(np.exp(1j * angles)))
 
 
 def _totals(evidence: Evidence, cell: CellResult, domain: Domain, where: str) -> Iterator[str]:
