@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont  # comes with matplotlib
 
+from advnerf_core.data.video import read_video
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import Film
 from advnerf_core.report.palette import DARK
@@ -121,10 +122,7 @@ def compose(tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: flo
 
 def read_clip(path: Path) -> Frames:
     """Decode a whole clip to RGB, ``[N, height, width, 3]``."""
-    with av.open(str(path)) as container:
-        return np.stack(
-            [np.asarray(f.to_ndarray(format="rgb24"), dtype=np.uint8) for f in container.decode(video=0)]
-        )
+    return np.stack([frame for *_, frame in read_video(path)])
 
 
 def webp(frames: Sequence[Image.Image], frame_ms: float, quality: int) -> bytes:
@@ -156,9 +154,8 @@ def _data_uri(media_type: str, data: bytes) -> str:
 
 def frame_of(path: Path, number: int) -> Frames:
     """One frame ``[height, width, 3]`` of a clip, by its number; the last one of a shorter clip."""
-    with av.open(str(path)) as container:
-        (frame,) = deque(islice(container.decode(video=0), number + 1), maxlen=1)
-        return np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
+    ((*_, frame),) = deque(islice(read_video(path), number + 1), maxlen=1)
+    return frame
 
 
 def _encode(path: Path, codec: str, quality: int, rate_hz: float, frames: Iterator[Frames]) -> None:
