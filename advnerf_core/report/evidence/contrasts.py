@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.evidence.intervals import clustered_interval
 from advnerf_core.report.evidence.registration import Contrast
 from advnerf_core.report.evidence.results import Evidence
-from advnerf_core.report.reference import Domain
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def _row(evidence: Evidence, contrast: Contrast, victim: str, method: str) -> Co
     if not pairs or any(one.attack_id != other.attack_id for one, other in pairs):
         return None
     values = [
-        [_excess_m(evidence, one, contrast.before_in), _excess_m(evidence, other, contrast.after_in)]
+        [evidence.excesses_m(one, contrast.before_in), evidence.excesses_m(other, contrast.after_in)]
         for one, other in pairs
     ]
     drives = min(len(each) for pair in values for each in pair)
@@ -97,8 +94,3 @@ def _row(evidence: Evidence, contrast: Contrast, victim: str, method: str) -> Co
         drives=second.size,
         registered=all(evidence.is_registered(cell) for pair in pairs for cell in pair),
     )
-
-
-def _excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> Sequence[float]:
-    """Excess of each drive [m per tick], in the order of the measured starts."""
-    return [outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, domain)]

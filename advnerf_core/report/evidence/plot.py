@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,7 +19,7 @@ _MOST_COLUMNS = 8
 _DOMAINS_APART = 0.27
 
 
-def excess_plot(evidence: Evidence, titles: Mapping[str, str] = MappingProxyType({})) -> Figure:
+def excess_plot(evidence: Evidence, titles: Mapping[str, str]) -> Figure:
     """Excess |CTE| per tick of each drive, one column per search; for sets with many conditions the means, one line per condition.
 
     ``titles`` has the names of victims on pages, if they differ.
@@ -38,7 +37,7 @@ def _drives(evidence: Evidence, shown: list[Row], titles: Mapping[str, str]) -> 
             cells = evidence.searches((row.scenario, row.placement, row.victim, row.method))
             across = np.linspace(-0.28, 0.16, len(cells)) if len(cells) > 1 else [0.0]
             for x, cell in zip(across, cells, strict=True):
-                values = [each.excess_cte_m_per_tick for each in evidence.outcomes(cell, row.domain)]
+                values = evidence.excesses_m(cell, row.domain)
                 face = style.light if filled else "none"
                 ax.plot([place + x] * len(values), values, "o", ms=3.5, mfc=face, mec=style.light, mew=0.9)
             if row.low_m is not None and row.high_m is not None:
@@ -52,8 +51,7 @@ def _drives(evidence: Evidence, shown: list[Row], titles: Mapping[str, str]) -> 
         ax.set_xticks(range(len(shown)), names, size=7.5)
         ax.set(ylabel="excess |CTE| per tick over the plain object [m]", xlim=(-0.6, len(shown) - 0.4))
         ax.grid(axis="x", visible=False)
-    figure: Figure = ax.figure
-    return figure
+    return ax.figure
 
 
 def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
@@ -84,5 +82,4 @@ def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
         ax.set_yticks(range(len(places)), [name.replace("_", " ") for name in names])
         ax.set(xlabel="excess |CTE| per tick over the plain object [m]", ylim=(len(places) - 0.5, -0.5))
         ax.grid(axis="y", visible=False)
-    figure: Figure = ax.figure
-    return figure
+    return ax.figure

@@ -245,10 +245,7 @@ def _difference(
     evidence: Evidence, method: Sequence[CellResult], baseline: Sequence[CellResult]
 ) -> ClusteredInterval | None:
     """Interval of the difference in deployed excess: searches of two methods, from the same starts."""
-    one, other = (
-        [[outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, "deployed")] for cell in cells]
-        for cells in (method, baseline)
-    )
+    one, other = ([evidence.excesses_m(cell, "deployed") for cell in cells] for cells in (method, baseline))
     if len({len(each) for each in (*one, *other)}) != 1:
         return None
     return difference_interval(np.array(one), np.array(other), evidence.registration.level)
@@ -265,7 +262,7 @@ def _search_means(evidence: Evidence, cell: CellResult) -> SearchMeans:
 
 def mean_excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> float:
     """Mean excess |CTE| per tick of a cell's drives [m]; the cell must have some in this domain."""
-    return float(np.mean([outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, domain)]))
+    return float(np.mean(evidence.excesses_m(cell, domain)))
 
 
 def _off_track(evidence: Evidence, cells: Sequence[CellResult]) -> list[list[bool]]:

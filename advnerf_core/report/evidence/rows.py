@@ -148,6 +148,10 @@ class CellDrives:
             )
         ]
 
+    def excesses_m(self, cell: CellResult, domain: Domain, control: str = NONE) -> list[float]:
+        """Excess |CTE| per tick of each drive of a cell over the control [m], in the order of the starts."""
+        return [outcome.excess_cte_m_per_tick for outcome in self.outcomes(cell, domain, control)]
+
 
 def make_row(drives: CellDrives, key: Key, domain: Domain) -> Row | None:
     """The row of one method against one victim; None if it has no drives, or no drives to compare with."""
@@ -157,8 +161,8 @@ def make_row(drives: CellDrives, key: Key, domain: Domain) -> Row | None:
         return None
     # The excess of the plain object over itself is zero: its row shows what the other rows exceed.
     values = [
-        drives.mean_ctes_m(cell, domain) if cell.method == NONE else _excesses_m(found)
-        for cell, found in zip(cells, outcomes, strict=True)
+        drives.mean_ctes_m(cell, domain) if cell.method == NONE else drives.excesses_m(cell, domain)
+        for cell in cells
     ]
     shared = drives.share_starts(cells, domain)
     interval = _interval(drives, values, shared)
@@ -187,14 +191,10 @@ def make_row(drives: CellDrives, key: Key, domain: Domain) -> Row | None:
     )
 
 
-def _excesses_m(outcomes: Sequence[Outcome]) -> list[float]:
-    return [outcome.excess_cte_m_per_tick for outcome in outcomes]
-
-
 def _over_no_object_m(drives: CellDrives, cells: Sequence[CellResult], domain: Domain) -> list[list[float]]:
     """Excess of each drive over no object, by cell; empty if a cell has no drives to compare with, or is the control itself."""
-    found = [drives.outcomes(cell, domain, EMPTY) for cell in cells if cell.method != EMPTY]
-    return [_excesses_m(outcomes) for outcomes in found] if all(found) else []
+    found = [drives.excesses_m(cell, domain, EMPTY) for cell in cells if cell.method != EMPTY]
+    return found if all(found) else []
 
 
 def _mean(values: Sequence[Sequence[float]]) -> float:

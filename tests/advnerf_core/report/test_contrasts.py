@@ -116,7 +116,7 @@ def test_the_page_and_the_picture_name_the_conditions(evidence: Evidence) -> Non
     assert "### What each difference costs" in text
     assert "| learned scene to world | hardened | gradient | 6 x 5 |" in text
     assert "| native | hardened | gradient | deployed |" in text
-    names = [label.get_text() for label in excess_plot(evidence).axes[0].get_xticklabels()]
+    names = [label.get_text() for label in excess_plot(evidence, {}).axes[0].get_xticklabels()]
     assert any("native" in name for name in names)
 
 
