@@ -8,8 +8,7 @@ from typing import Any
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.files import sha256_of
-from advnerf_core.report.audit_parts import AuditedObject, Evidence
-from advnerf_core.report.audit_result import AuditComparison, AuditResult, read_audit
+from advnerf_core.report.audit_result import AuditComparison, AuditedObject, AuditResult, Evidence, read_audit
 from nodes.audit.drives import FOUND, NO_OBJECT, PLAIN_OBJECT
 from nodes.audit.kept import read_drives
 from nodes.audit.verdict import ArmDrives, change_of

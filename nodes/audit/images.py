@@ -10,7 +10,7 @@ from advnerf_core.data.image_files import HEIF_SUFFIXES, SUFFIXES
 from advnerf_core.data.scan_folder import DATA_SET, SCANS, ScanFolder, scan_of
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_json
-from advnerf_core.report.audit_parts import PlaceKind, Scale
+from advnerf_core.report.audit_result import PlaceKind, Scale
 from nodes.audit.asking import UnansweredError
 from nodes.experiment.engine.artefact import hash_of
 from nodes.lab.importing.metric_options import MetricOptions

@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from advnerf_core.attack.artifact import face_texture, load_attack
 from advnerf_core.geometry import Array, planar_poses
 from advnerf_core.policies.network import tensor_to_images
-from advnerf_core.report.audit_parts import (
+from advnerf_core.report.audit_result import (
+    AuditControl,
     AuditedDrives,
     Control,
+    ControlKind,
     DisturbedDrives,
     Evidence,
     JudgedStart,
     RoutePoint,
 )
-from advnerf_core.report.audit_result import AuditControl, ControlKind
 from advnerf_core.report.clips import ClipTrack, write_film
 from advnerf_core.report.data import Film
 from advnerf_core.scene.surrogate import Surrogate

@@ -13,8 +13,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
-from advnerf_core.report.audit_parts import AuditedDrives, Control
-from advnerf_core.report.audit_result import AuditResult, read_audit
+from advnerf_core.report.audit_result import AuditedDrives, AuditResult, Control, read_audit
 from hardware.worlds.paths import ReferencePath
 from nodes.audit.drives import FOUND, FOUND_DISTURBED, PLAIN_DISTURBED
 from nodes.audit.judging import CONTROLS, Judged

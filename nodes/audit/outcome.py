@@ -13,23 +13,21 @@ from advnerf_core.data.image_files import write_image
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import sha256_of, write_atomically
 from advnerf_core.policies.load import source_sha256
-from advnerf_core.report.audit_parts import (
+from advnerf_core.report.audit_result import (
+    AuditBudget,
+    AuditComparison,
     AuditedObject,
     AuditedPlace,
     AuditedPolicy,
     AuditedVehicle,
-    AuditQuestion,
-    JudgedObject,
-    PlacedPose,
-)
-from advnerf_core.report.audit_result import (
-    AuditBudget,
-    AuditComparison,
     AuditFidelity,
+    AuditQuestion,
     AuditResult,
     AuditStarts,
     AuditVerdict,
+    JudgedObject,
     NotTried,
+    PlacedPose,
     PlantedControl,
     StartSet,
     TriedSearch,

@@ -12,8 +12,7 @@ from advnerf_core.data.image_files import read_stored
 from advnerf_core.driving.path import Path
 from advnerf_core.files import write_atomically
 from advnerf_core.report import plots
-from advnerf_core.report.audit_parts import AuditedObject, Evidence
-from advnerf_core.report.audit_result import AuditResult, TriedSearch
+from advnerf_core.report.audit_result import AuditedObject, AuditResult, Evidence, TriedSearch
 from advnerf_core.report.clips import image_uri
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import Film, Scene

@@ -9,7 +9,7 @@ from typing import Any
 
 from advnerf_core.documents import dump_yaml
 from advnerf_core.files import write_atomically
-from advnerf_core.report.audit_parts import Evidence, PlaceKind, Scale
+from advnerf_core.report.audit_result import Evidence, PlaceKind, Scale
 from nodes.experiment.plan.object_kinds import PANEL
 
 VICTIM, PLANTED, OBJECT = "policy", "planted", "object"

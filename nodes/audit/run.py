@@ -12,8 +12,7 @@ from rich.console import Console
 
 from advnerf_core.data.image_files import write_image
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.report.audit_parts import Evidence
-from advnerf_core.report.audit_result import AuditComparison, AuditResult, PlantedControl
+from advnerf_core.report.audit_result import AuditComparison, AuditResult, Evidence, PlantedControl
 from nodes.audit.budget import Costs
 from nodes.audit.comparing import ATTACK_KEPT, Before, is_worse
 from nodes.audit.drives import (

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from advnerf_core.driving.metrics import DriveMetrics
-from advnerf_core.report.audit_parts import AuditEffect, Control
+from advnerf_core.report.audit_result import AuditEffect, Control
 from advnerf_core.report.evidence.mean_estimate import one_sample
 
 Floats = NDArray[np.float64]

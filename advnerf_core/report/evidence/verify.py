@@ -24,6 +24,9 @@ from advnerf_core.report.evidence.verifying.numbers import number_problems, publ
 from advnerf_core.report.evidence.verifying.registered import missing_cells
 from advnerf_core.report.evidence.verifying.victims import drives_badly, read_declared
 
+# Of files of the right form that make no sense.
+_SENSELESS = (ValueError, LookupError, TypeError, AttributeError)
+
 
 @dataclass(frozen=True)
 class Verified:
@@ -58,12 +61,7 @@ def verify_set(folder: Path) -> Verified:
             problems = tuple(set_problems(folder, evidence, under_way=True))
             return Verified(folder.name, 0, _drives(evidence), problems, awaits=missing)
         return _verified(folder, evidence, withdrawn, declared)
-    except (
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-    ) as error:  # files of the right form that make no sense
+    except _SENSELESS as error:
         return Verified(
             folder.name, 0, 0, (f"{folder}: cannot be computed again: {error!r}; restore it from git",)
         )
@@ -99,14 +97,7 @@ def verify_beside(published: Path) -> tuple[str, ...]:
     try:
         if not page.exists() or page.read_text(encoding="utf-8") != page_text(published):
             problems.append(f"{page}: is not the page of the published sets")
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        StopIteration,
-    ) as error:  # of damaged manifests
+    except (OSError, StopIteration, *_SENSELESS) as error:  # of damaged manifests
         problems.append(f"{page}: cannot be made from the published sets: {error!r}")
     return tuple(problems)
 

@@ -17,14 +17,14 @@ from scenariogeneration import xosc
 from scenariogeneration.helpers import prettify
 
 from advnerf_core.files import write_atomically
-from advnerf_core.report.audit_parts import (
+from advnerf_core.report.audit_result import (
     AuditedDrives,
     AuditedObject,
     AuditedVehicle,
+    AuditResult,
     JudgedStart,
     RoutePoint,
 )
-from advnerf_core.report.audit_result import AuditResult
 
 EGO, OBJECT, REPLAY = "Ego", "Object", "replay"
 _MINOR_VERSION = 2
