@@ -120,7 +120,7 @@ def _moved(drive: KeptDrive, longest_m: float) -> Motion:
 
 
 def _totals(evidence: Evidence, cell: CellResult, domain: Domain, where: str) -> Iterator[str]:
-    said = cell.surrogate if domain == "surrogate" else cell.deployed
+    said = cell.drives(domain)
     if said is None:
         return
     clean = evidence.without(cell)
