@@ -208,7 +208,7 @@ def test_an_object_out_of_sight_has_no_gradient_and_the_check_says_so(tmp_path):
 @pytest.mark.parametrize("changes", [["over.method=[random]"], ["attack.robustness.noise=0.01"]])
 def test_a_search_of_an_object_out_of_sight_is_no_result(tmp_path, changes):
     request = loaded(tiny_request(tmp_path, evaluations=2), [AWAY, *changes])
-    with pytest.raises(ConfigError, match="expected a in view of the searched drives, got .* ticks whose"):
+    with pytest.raises(ConfigError, match=r"expected a in view of the searched drives, got \d+ ticks whose"):
         run_attack(request, tmp_path / "run", ProgressDisplay())
     assert not attack_file(tmp_path / "run", 0).exists()
 
