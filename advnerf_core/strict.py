@@ -6,6 +6,7 @@ pydantic takes ``true`` for 1, ``"12"`` for 12 and ``1`` for ``true``. In a file
 from __future__ import annotations
 
 import dataclasses
+import re
 import types
 import typing
 from collections.abc import Callable, Iterator
@@ -25,6 +26,8 @@ COMPLETE = "complete"
 M = TypeVar("M")
 _DONE = "advnerf_strict"
 _NOT_SCHEMAS = frozenset({"metadata", "default", "serialization", "expected", "config", "cls", "ref"})
+# In pydantic's path of a wrong value: a tag of several words, a type with parameters, the name of a class.
+_INSERTED = re.compile(r"[ \[]|^[A-Z][A-Za-z0-9]*[a-z][A-Za-z0-9]*$")
 _DATES = frozenset({"date", "datetime", "time", "timedelta"})
 
 
@@ -217,7 +220,8 @@ def _explain(model: Any, document: Document, error: ValidationError) -> list[str
         key = _as_written(document.data, tuple(problem["loc"]))
         # A value with several possible types fails as each of them.
         lines.setdefault(key, f"{document.place(key)}: {_what(model, key, problem)}")
-    return list(lines.values())
+    # A list with a wrong item is too short as well, and a section is no word.
+    return [line for key, line in lines.items() if not any(key == each[: len(key)] != each for each in lines)]
 
 
 def _what(model: Any, key: Key, problem: Any) -> str:
@@ -225,8 +229,13 @@ def _what(model: Any, key: Key, problem: Any) -> str:
     if problem["type"] == "extra_forbidden":
         valid = ", ".join(_valid_keys(model, tuple(problem["loc"])[:-1])) or "none"
         return f"unknown key {name}; valid keys here: {valid}"
+    if problem["type"] == "too_short":
+        return f"{name}: expected at least {problem['ctx']['min_length']}, got {problem['ctx']['actual_length'] or 'none'}"
     if problem["type"] == "missing":
         return f"{name} is missing; add it"
+    if problem["type"] == "union_tag_invalid":
+        context = problem["ctx"]
+        return f"{name}: expected {context['discriminator']} to be one of {context['expected_tags']}, got {context['tag']!r}"
     message = str(problem["msg"]).removeprefix("Value error, ")
     message = message[:1].lower() + message[1:]
     # The error of a check of several keys, or of a name, includes the input; the whole file would not help.
@@ -239,13 +248,11 @@ def _what(model: Any, key: Key, problem: Any) -> str:
 
 
 def _as_written(data: Any, location: Key) -> Key:
-    """Path of a key in the user's file, without the ``kind`` or the tag that pydantic inserts for sections with several models.
-
-    Tags are words with spaces, which no key is.
-    """
+    """Path of a key in the user's file, without the ``kind``, the tag or the type that pydantic inserts for values of several types."""
     key: list[str | int] = []
     for part in location:
-        if isinstance(data, dict) and part not in data and (data.get("kind") == part or " " in str(part)):
+        inserted = _INSERTED.search(str(part)) or (isinstance(data, dict) and data.get("kind") == part)
+        if inserted and not (isinstance(data, dict) and part in data):
             continue
         key.append(part)
         inside = isinstance(data, dict) or (
@@ -266,7 +273,10 @@ def _valid_keys(annotation: Any, key: Key) -> list[str]:
     arguments = typing.get_args(annotation)
     origin = typing.get_origin(annotation)
     if origin in (Union, types.UnionType):
-        if key and (chosen := [option for option in arguments if key[0] in (_kind(option), _tag(option))]):
+        named = (
+            option for option in arguments if key and key[0] in (_kind(option), _tag(option), _name(option))
+        )
+        if chosen := list(named):
             return _valid_keys(chosen[0], key[1:])
         return next((keys for option in arguments if (keys := _valid_keys(option, key))), [])
     if key and arguments and isinstance(origin, type) and issubclass(origin, typing.Iterable):
@@ -277,6 +287,11 @@ def _valid_keys(annotation: Any, key: Key) -> list[str]:
 def _tag(option: Any) -> Any:
     """The tag of a model that a function selects; None without one."""
     return next((each.tag for each in typing.get_args(option) if isinstance(each, Tag)), None)
+
+
+def _name(option: Any) -> Any:
+    """The name of a class, which selects it where nothing else does."""
+    return getattr(option, "__name__", None)
 
 
 def _kind(option: Any) -> Any:

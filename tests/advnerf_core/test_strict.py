@@ -2,12 +2,12 @@ import importlib
 import pkgutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import pytest
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from advnerf_core.documents import parse_yaml
+from advnerf_core.documents import Document, parse_yaml
 from advnerf_core.errors import ConfigError
 from advnerf_core.strict import StrictModel, validate
 
@@ -135,3 +135,32 @@ def test_every_model_of_the_packages_is_strict():
 def test_a_model_is_strict_without_a_document_too():
     with pytest.raises(ValidationError):
         Config(speed_mps=True)
+
+
+class Limits(StrictModel):
+    psnr_db: float = 25.0
+    T_world_from_car: float = 0.0
+
+
+class Judged(StrictModel):
+    gate: Literal["steering"] | Limits | None = None
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)
+
+
+@pytest.mark.parametrize(
+    ("written", "told"),
+    [
+        ({"gate": {"psnr": 3}}, "unknown key gate.psnr; valid keys here: T_world_from_car, psnr_db"),
+        ({"gate": {"psnr_db": "x"}}, "gate.psnr_db: input should be a valid number, got 'x'"),
+        (
+            {"gate": {"T_world_from_car": "x"}},
+            "gate.T_world_from_car: input should be a valid number, got 'x'",
+        ),
+        ({"seeds": [-1]}, "seeds.0: input should be greater than or equal to 0, got -1"),
+        ({"seeds": []}, "seeds: expected at least 1, got none"),
+    ],
+)
+def test_a_wrong_value_of_several_types_is_told_once_by_the_key_that_was_written(written, told):
+    with pytest.raises(ConfigError) as error:
+        validate(Judged, Document(written, "file.yaml"))
+    assert str(error.value).splitlines() == [f"file.yaml: {told}"]

@@ -62,6 +62,10 @@ def _with_setting(file: Path, setting: str | None, above: Sequence[Path]) -> Exp
     settings = document.data.pop("settings", None) or {}
     if setting is None:
         setting = DEFAULT_SETTING if settings else ""
+        if settings and setting not in settings:
+            raise ConfigError(
+                f"{file}: expected one of the settings {', '.join(settings)}, got none; give --setting, or call one {DEFAULT_SETTING}"
+            )
     if setting or settings:
         if setting not in settings:
             raise ConfigError(

@@ -60,6 +60,12 @@ def test_a_wrong_value_is_one_error_with_the_way_out(tmp_path, overrides, messag
 def test_an_unknown_setting_names_those_there_are(tmp_path):
     with pytest.raises(ConfigError, match="no setting called 'huge'; known are demo, full"):
         room(tmp_path, "huge")
+    file = tmp_path / "mine.experiment.yaml"
+    file.write_text("name: mine\nsettings: {quick: {}, long: {}}\n")
+    with pytest.raises(
+        ConfigError, match="expected one of the settings quick, long, got none; give --setting"
+    ):
+        load_experiment(file, None, [], None)
 
 
 def test_an_error_names_the_line_of_the_file(tmp_path):

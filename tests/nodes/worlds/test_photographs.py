@@ -211,6 +211,11 @@ def test_an_open_path_from_a_file(tmp_path: Path) -> None:
         points_of(file)
     with pytest.raises(WorldError, match="one smooth way"):
         path_along(np.zeros((4, 2)), 0.25, False)
+    with pytest.raises(WorldError, match="expected at least 4 points along the path, got 2"):
+        path_along(np.array([[0.0, 0.0], [1.0, 0.0]]), 0.25, False)
+    to_and_fro = [[0.1 * x, 0.0] for x in [*range(20), *range(18, 5, -1), *range(7, 40)]]
+    with pytest.raises(WorldError, match="turns back at x = 1"):
+        path_along(np.array(to_and_fro), 0.25, False)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,8 @@ _LONGEST_STEPS, _FORWARD = 5.0, 0.5
 _LEAST_SHARE = 0.25
 # In half lanes: distance of the points that the path passes, and its largest error there.
 _SPACING, _MISS = 0.5, 0.04
+# Of a path by points: a parabola through fewer says nothing of where it leads.
+_FEWEST = 4
 
 
 def driving_order(cars: Array, names: Sequence[str]) -> Sequence[int]:
@@ -89,12 +91,23 @@ def path_along(points: Array, off_track_m: float, closed: bool) -> ReferencePath
     Raises:
         WorldError: The points do not form a smooth route.
     """
+    if len(points) < _FEWEST:
+        raise WorldError(
+            f"expected at least {_FEWEST} points along the path, got {len(points)}; put more between them"
+        )
     try:
         averaged = _averaged(points, _SPACING * off_track_m, closed)
+        steps = np.diff(averaged, axis=0)
+        if (back := np.flatnonzero((steps[1:] * steps[:-1]).sum(axis=1) < 0.0)).size:
+            x_m, y_m = averaged[back[0] + 1]
+            raise ValueError(
+                f"the path turns back at x = {x_m:.2f} m, y = {y_m:.2f} m; put the points in driving order"
+            )
         return path_through(averaged, closed=closed, tolerance_m=_MISS * off_track_m)
     except (ValueError, np.linalg.LinAlgError) as error:
         raise WorldError(
-            f"expected points on one smooth way, at most {_SPACING * off_track_m:g} m apart, got {len(points)} points: {error}"
+            f"expected points on one smooth way, at most {_SPACING * off_track_m:g} m apart ({_SPACING:g} of off_track_m), "
+            f"got {len(points)} points: {error}"
         ) from None
 
 
