@@ -59,6 +59,7 @@ class ExperimentConfig(StrictModel):
     horizon: Positive = Field(default=60, description="Control ticks of every drive (T).")
     dt_s: PositiveNumber = Field(
         default=0.1,
+        le=2.0,
         description="Control tick [s]; the paper's CARLA runs have finer ones: docs/intersection.md.",
     )
     held_cap_m: PositiveNumber = Field(

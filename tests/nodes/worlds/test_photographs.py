@@ -206,6 +206,15 @@ def test_an_open_path_from_a_file(tmp_path: Path) -> None:
         < 0.01
     )
     assert path.length_m == pytest.approx(3.0, abs=0.02)
+    file.write_text("x_m,y_m\n" + "\n".join(f"{x + 100.0},{y}" for x, y in rows))
+    with pytest.raises(WorldError, match=r"expected a path among the photographs, .* got x = 10"):
+        place(
+            tmp_path,
+            path="way.csv",
+            closed=False,
+            ground_z_m=1.2,
+            camera={"z_m": 0.2, "pitch_down_rad": 0.17},
+        ).describe()
     file.write_text("x_m,y_m\n0,0\n1;2\n")
     with pytest.raises(ConfigError, match=r"way\.csv:3: expected 2 fields as in the header"):
         points_of(file)
@@ -225,6 +234,8 @@ def test_an_open_path_from_a_file(tmp_path: Path) -> None:
         ({"path": "images_of_mine/transforms.json", "camera": {"z_m": 0}}, "camera.z_m"),
         ({"path": "images_of_mine/images/00000.png"}, "expected ground_z_m and camera.pitch_down_rad"),
         ({"car": {}}, "car.speed_mps is missing"),
+        ({"camera": {"z_m": 200}}, "camera.z_m: input should be less than or equal to 20, got 200"),
+        ({"camera": {"z_m": 0.2, "pitch_down_rad": 10}}, "camera.pitch_down_rad: input should be less than"),
     ],
 )
 def test_what_is_missing_is_said(tmp_path: Path, changes: dict[str, object], message: str) -> None:

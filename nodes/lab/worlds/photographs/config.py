@@ -17,6 +17,11 @@ from nodes.lab.located import content_sha256, located
 
 DRIVEN = "driven"
 AboveZero = Annotated[float, Field(gt=0.0)]
+# Beyond any car: what is more was written in mm, degrees or km/h.
+SpeedMps = Annotated[float, Field(gt=0.0, le=100.0)]
+CarLengthM = Annotated[float, Field(gt=0.0, le=20.0)]
+PlaceOnCarM = Annotated[float, Field(ge=-20.0, le=20.0)]
+Pitch = Annotated[float, Field(ge=-1.6, le=1.6)]
 
 
 def _located(name: str, info: ValidationInfo) -> str:
@@ -35,8 +40,8 @@ class DrivenCarConfig(StrictModel):
         max_steering_rad: Largest angle of the front wheels to either side [rad]; without a wheelbase, largest turn rate [rad/s].
     """
 
-    speed_mps: AboveZero
-    wheelbase_m: AboveZero | None
+    speed_mps: SpeedMps
+    wheelbase_m: CarLengthM | None
     max_steering_rad: AboveZero
 
     @model_validator(mode="after")
@@ -64,10 +69,10 @@ class MountedCameraConfig(StrictModel):
         pinhole: Intrinsics of the camera; None: the photographs', undistorted.
     """
 
-    x_m: float = 0.0
-    y_m: float = 0.0
-    z_m: AboveZero
-    pitch_down_rad: float | None = None
+    x_m: PlaceOnCarM = 0.0
+    y_m: PlaceOnCarM = 0.0
+    z_m: CarLengthM
+    pitch_down_rad: Pitch | None = None
     pinhole: Pinhole | None = None
 
 

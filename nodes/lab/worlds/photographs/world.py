@@ -26,6 +26,8 @@ _BESIDE, _BELOW_M = 0.5, 0.1
 _BEYOND = 0.01
 # A camera that is screwed on; its roll is left out of the mount.
 _MOST_ROLL_RAD = math.radians(10.0)
+# So far from the nearest photograph a path may always lead [m].
+_NEAR_M = 5.0
 _HALF_PX = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 
 
@@ -117,7 +119,20 @@ class Photographs(Undriven):
         """Measured points ``[N, 2]`` of the path [m]."""
         if self.config.shows_path:
             return driven_track(self._cars_of(self._driven))
-        return points_of(Path(self.config.path))
+        points = points_of(Path(self.config.path))
+        away_m = self._distances_m(points).min(axis=0)
+        if len(points) and away_m.max() > max(self.extent_m, _NEAR_M):
+            x_m, y_m = points[away_m.argmax()]
+            raise WorldError(
+                f"expected a path among the photographs, in their frame and in metres, got x = {x_m:g} m, y = {y_m:g} m, which is "
+                f"{away_m.max():.0f} m from the nearest of them; nothing there was seen"
+            )
+        return points
+
+    def _distances_m(self, points: Array) -> Array:
+        """From each photograph to each point ``[N, M]`` on the ground."""
+        places = np.stack([each.T_world_from_camera[:2, 3] for each in self._all])
+        return np.linalg.norm(places[:, None] - points[None], axis=2)
 
     def _box(self, points: Array) -> Box:
         poses = np.stack([each.T_world_from_camera for each in self._all])
@@ -166,9 +181,7 @@ class Photographs(Undriven):
 
     def _nearest(self) -> list[PosedImage]:
         """The half of the photographs whose cameras are nearest to the points of the path, in their order."""
-        points = points_of(Path(self.config.path))
-        places = np.stack([each.T_world_from_camera[:2, 3] for each in self._all])
-        away_m = np.linalg.norm(places[:, None] - points[None], axis=2).min(axis=1)
+        away_m = self._distances_m(self.path_points()).min(axis=1)
         near = np.sort(np.argsort(away_m, kind="stable")[: (len(away_m) + 1) // 2])
         return [self._all[index] for index in near]
 
