@@ -15,7 +15,7 @@ from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.strict import StrictModel
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
 from hardware.worlds.paths import ReferencePath, Segment
-from hardware.worlds.world import Box, CarDescription, WorldDescription
+from hardware.worlds.world import Box, CarDescription, WorldDescription, WorldError
 from nodes.lab.located import NamedFile, NamedFolder
 from nodes.lab.worlds.undriven import Undriven
 
@@ -105,14 +105,20 @@ class OwnScene(Undriven):
         """
         camera, vehicle, room = self._calibrated
         limits = (vehicle.limits.steering_min_rad, vehicle.limits.steering_max_rad)
-        start = self.config.start or room.start_pose
+        start, box = self.config.start or room.start_pose, self._box()
+        low, high = np.array(box.min_m[:2]), np.array(box.max_m[:2])
+        if not ((low <= start[:2]) & (start[:2] <= high)).all():
+            raise WorldError(
+                f"expected drives that start in the learned box, x {low[0]:g} to {high[0]:g} m and y {low[1]:g} to {high[1]:g} m, "
+                f"got x = {start[0]:g} m, y = {start[1]:g} m; are scene and room calibration in one frame?"
+            )
         return WorldDescription(
             paths={PATH: _reference(room.reference_path, start, self.config.goal)},
             off_track_m=room.off_track_m,
             car=CarDescription("ackermann", self.config.speed_mps, limits, vehicle.wheelbase_m),
             camera=camera.pinhole,
             T_car_from_camera=camera.mount,
-            box=self._box(),
+            box=box,
             fence_m=float(np.abs(np.array(room.fence_m)).min()),
         )
 

@@ -2,8 +2,11 @@
 
 import shutil
 
+import pytest
+
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.documents import read_json
+from hardware.worlds.world import WorldError
 from nodes.experiment.node.search import run_attack
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.steps.keys import settings_hash
@@ -50,3 +53,9 @@ def test_cells_depend_on_what_files_hold_and_not_on_where_they_lie(tmp_path):
     assert keys(tmp_path / "b") == before
     assert not set(keys(tmp_path / "b", "objects=[{name: a, kind: panel, x_m: 1, y_m: -1}]")) & set(before)
     assert not set(keys(tmp_path / "b", "world.speed_mps=0.7")) & set(before)
+
+
+def test_a_start_outside_the_learned_box_is_refused(tmp_path):
+    file = tiny_request(tmp_path)
+    with pytest.raises(WorldError, match=r"expected drives that start in the learned box, .* got x = 70 m"):
+        load_experiment(file, None, ["world.start=[70, 0, 0]"], tmp_path / "run")
