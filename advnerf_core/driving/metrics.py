@@ -6,7 +6,9 @@ last |CTE| holds for the remaining ticks, capped, so that hitting a wall or the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -93,15 +95,37 @@ def drive_metrics(
             that the car stopped after the last one; more are ignored.
         stopped_tick: The car stands from this tick on, if known (see :func:`first_still_tick`).
     """
-    limits = horizon or Horizon()
-    xy = np.asarray(states, dtype=np.float64)
-    if xy.ndim != 2 or xy.shape[0] < 2 or xy.shape[1] < 2 or not np.isfinite(xy).all():
-        raise ValueError(f"expected finite states [K >= 2, >= 2] of one drive, got shape {list(xy.shape)}")
-    seen = min(xy.shape[0] - 1, limits.ticks)
-    if stopped_tick is not None:
-        seen = min(seen, max(stopped_tick, 1))
-    ctes = path.project(xy[1 : seen + 1, :2]).cte_m
-    held = limits.ticks - seen
+    return metrics_of_drives(path, [states], horizon, [stopped_tick])[0]
+
+
+def metrics_of_drives(
+    path: Path,
+    drives: Sequence[ArrayLike],
+    horizon: Horizon | None = None,
+    stopped_ticks: Sequence[int | None] = (),
+) -> list[DriveMetrics]:
+    """`drive_metrics` of drives along one path, whose positions are projected together; ``stopped_ticks`` is one for each drive, or none."""
+    limits, positions = horizon or Horizon(), []
+    for states, stopped_tick in zip_longest(drives, stopped_ticks):
+        xy = np.asarray(states, dtype=np.float64)
+        if xy.ndim != 2 or xy.shape[0] < 2 or xy.shape[1] < 2 or not np.isfinite(xy).all():
+            raise ValueError(
+                f"expected finite states [K >= 2, >= 2] of one drive, got shape {list(xy.shape)}"
+            )
+        seen = min(xy.shape[0] - 1, limits.ticks)
+        if stopped_tick is not None:
+            seen = min(seen, max(stopped_tick, 1))
+        positions.append(xy[1 : seen + 1, :2])
+    if not positions:
+        return []
+    ctes = path.project(np.concatenate(positions)).cte_m
+    parts = np.split(ctes, np.cumsum([len(each) for each in positions])[:-1])
+    return [_of_ctes(part, limits) for part in parts]
+
+
+def _of_ctes(ctes: Array, limits: Horizon) -> DriveMetrics:
+    """Metrics of a drive by its signed CTE ``[K]`` [m] at the ticks 1..K, after which it stood."""
+    held = limits.ticks - len(ctes)
     filled = np.concatenate([ctes, np.full(held, np.clip(ctes[-1], -limits.held_cap_m, limits.held_cap_m))])
     magnitude = np.abs(filled)
     off = np.flatnonzero(magnitude > limits.off_track_m)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.driving.metrics import DriveMetrics
+from advnerf_core.driving.metrics import DriveMetrics, metrics_of_drives
 from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.conditions import CONTROLS, NONE
 from advnerf_core.report.evidence.anytime import AnytimeTest, anytime_test
@@ -120,7 +120,11 @@ class Evidence(CellDrives):
                 self._paths[scenario_key(cell.scenario, cell.placement)],
                 self.scenario_of(cell).horizon,
             )
-            self._metrics[key] = [drive.metrics(path, horizon) for drive in cell.kept.get(domain, ())]
+            drives = cell.kept.get(domain, ())
+            stopped = [drive.driven_ticks for drive in drives]
+            self._metrics[key] = metrics_of_drives(
+                path, [drive.poses() for drive in drives], horizon, stopped
+            )
         return self._metrics[key]
 
     def has(self, cell: CellResult, domain: Domain) -> bool:

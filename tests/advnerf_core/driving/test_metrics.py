@@ -1,8 +1,14 @@
 import numpy as np
 import pytest
 
-from advnerf_core.driving.metrics import Horizon, drive_metrics, first_still_tick, states_at_ticks
-from advnerf_core.driving.path import Line, Path
+from advnerf_core.driving.metrics import (
+    Horizon,
+    drive_metrics,
+    first_still_tick,
+    metrics_of_drives,
+    states_at_ticks,
+)
+from advnerf_core.driving.path import Arc, Line, Path
 
 LINE = Path.from_segments((0.0, 0.0, 0.0), [Line(100.0)], closed=False)
 
@@ -32,6 +38,20 @@ def test_a_stopped_car_keeps_its_last_error_up_to_the_cap() -> None:
     told = drive_metrics(LINE, _states([0.0, -2.0, -3.0, -3.0]), Horizon(ticks=3), stopped_tick=1)
     assert told.total_cte_m == pytest.approx(2.0 + 2 * 1.5)
     assert told.ctes_m[-1] == pytest.approx(-1.5)
+
+
+def test_drives_of_one_path_are_measured_together_as_each_alone() -> None:
+    winding = Path.from_segments((0.0, 0.0, 0.3), [Line(1.0), Arc(0.8, 1.2), Line(0.5)], closed=False)
+    rng = np.random.default_rng(0)
+    drives = [np.cumsum(rng.normal(0.1, 0.1, (ticks, 3)), axis=0) for ticks in (2, 9, 5, 12)]
+    stopped = [None, 3, 0, 40]
+    together = metrics_of_drives(winding, drives, Horizon(ticks=8), stopped)
+    alone = [
+        drive_metrics(winding, one, Horizon(ticks=8), tick) for one, tick in zip(drives, stopped, strict=True)
+    ]
+    assert together == alone
+    assert [each.held_ticks for each in together] == [7, 5, 7, 0]
+    assert metrics_of_drives(winding, []) == []
 
 
 def test_standing_is_recognised() -> None:
