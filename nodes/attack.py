@@ -60,6 +60,7 @@ class AttackNodeConfig(StrictModel):
 class AttackNode(Node):
     """Takes requests; publishes progress, pictures and the attack file."""
 
+    opens = "a process for the search"
     subscriptions = (_REQUEST, _CANCEL)
     publications = (_PROGRESS, *_IMAGES.values(), _FILE)
     tick_rate_hz = 20.0

@@ -73,6 +73,8 @@ class CameraNodeConfig(StrictModel):
 class CameraNode(Node):
     """Publishes frames as images and camera infos."""
 
+    opens = "a camera"
+
     def __init__(
         self,
         config: CameraNodeConfig,

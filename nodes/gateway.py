@@ -85,6 +85,7 @@ class GatewayConfig(StrictModel):
 class GatewayNode(Node):
     """Carries messages between the bus of this host and the link."""
 
+    opens = "a link to another host"
     raw = True
     tick_rate_hz = _TICK_HZ
 

@@ -114,6 +114,7 @@ class MonitorNode(Node):
         display: The open screen, which the node closes.
     """
 
+    opens = "a screen"
     publications = ("/monitor/attack", "/monitor/shown")
     tick_rate_hz = 20.0
 

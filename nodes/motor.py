@@ -91,6 +91,7 @@ class MotorNode(Node):
         on_twins_port: Returns whether the port is the one that the twin of this run has made.
     """
 
+    opens = "the motor controller"
     subscriptions = ("/safety/drive", "/safety/state", "/motor/check", "/vicon/car")
     publications = ("/motor/sent", "/motor/state", "/odom", "/diagnostics")
     tick_rate_hz = _TICK_RATE_HZ

@@ -51,6 +51,7 @@ FOLDER, DOOR, LOG = "page", "page/door.json", "page/acts.jsonl"
 class PageNode(Node):
     """Connects the bus, the desk and the web server."""
 
+    opens = "a web server"
     tick_rate_hz = _TICK_HZ
 
     def __init__(self, config: PageConfig, run_dir: Path) -> None:

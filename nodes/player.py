@@ -74,6 +74,7 @@ class PlayerNode(Node):
         terminal: File descriptor of a terminal whose keys control the player; None for no keys.
     """
 
+    opens = "another bag"
     subscriptions = (_CONTROL,)
     tick_rate_hz = _TICK_HZ
 

@@ -53,6 +53,7 @@ class RecorderNode(Node):
         queue: Messages that may wait per topic.
     """
 
+    opens = "a new bag"
     raw = True
     tick_rate_hz = _FLUSH_HZ
 

@@ -84,6 +84,7 @@ class Ros2Node(Node):
         instance: Random text of this process. A restart of this node counts as a restart of the publishers.
     """
 
+    opens = "a connection to ROS 2"
     raw = True
     tick_rate_hz = _TICK_HZ
 

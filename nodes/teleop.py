@@ -63,6 +63,7 @@ class TeleopNode(Node):
         read: Blocks for a bounded time and returns the input.
     """
 
+    opens = "a keyboard or gamepad"
     subscriptions = ("/safety/state", "/motor/sent")
     publications = ("/teleop/state", "/arm")
     tick_rate_hz = 20.0

@@ -25,6 +25,7 @@ RESET_TOPIC = "/twin/reset"
 class TwinNode(Node):
     """Runs the simulated lab."""
 
+    opens = "a simulated lab"
     subscriptions = (RESET_TOPIC,)
     tick_rate_hz = 10.0
 

@@ -72,6 +72,8 @@ class ViconNodeConfig(StrictModel):
 class ViconNode(Node):
     """Publishes poses as messages."""
 
+    opens = "a UDP port"
+
     def __init__(self, config: ViconNodeConfig) -> None:
         self._config = config
         self._receiver = _receiver(config)

@@ -44,6 +44,7 @@ class ViewerConfig(StrictModel):
 class ViewerNode(Node):
     """Forwards CDR bytes to a WebSocket without decoding."""
 
+    opens = "a web server"
     raw = True
 
     def __init__(self, config: ViewerConfig) -> None:

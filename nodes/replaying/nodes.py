@@ -31,6 +31,7 @@ from nodes.runtime.paths import RESOLVED_NAME
 
 # Modules that a bag may name. Other code runs only if the user names it.
 _OUR_MODULES = "nodes."
+_REPLAYABLE = "compositor, policy, counterfactual, safety, expert, calibration_drive, collect, or your own"
 
 
 @dataclass(frozen=True)
@@ -147,6 +148,8 @@ def _found_again(value: Any, files: Mapping[str, str]) -> Any:
 def _build(name: str, entry: NodeEntry, document: Document, choice: Choice, context: NodeContext) -> Node:
     spec = choice.replacements.get(name, entry.module)
     build, config_type = _builder(importlib.import_module(entry.module), spec.partition(":")[2])
+    if opens := getattr(getattr(build, "__self__", None), "opens", ""):
+        raise BagError(f"{name} cannot be replayed: it opens {opens}; replayable are {_REPLAYABLE}")
     if name in choice.replacements:
         document = _known_keys(document, config_type)
     try:
@@ -158,9 +161,7 @@ def _build(name: str, entry: NodeEntry, document: Document, choice: Choice, cont
     if node.inbox is not None or not node.publications:
         close_nodes({name: node})
         kind = "reads a device" if node.inbox is not None else "publishes nothing"
-        raise BagError(
-            f"{name} cannot be replayed: it {kind}; only nodes that turn messages into messages can be replayed"
-        )
+        raise BagError(f"{name} cannot be replayed: it {kind}; replayable are {_REPLAYABLE}")
     return node
 
 

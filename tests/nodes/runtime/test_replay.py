@@ -1,4 +1,7 @@
 import hashlib
+import importlib
+import inspect
+import re
 import sys
 from pathlib import Path
 
@@ -6,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+import nodes
 from nodes.bags.info import BagMessage
 from nodes.bags.reader import read_attachments, read_info, read_messages
 from nodes.bags.writer import BagWriter
@@ -248,7 +252,7 @@ def test_wrong_choices_are_one_clear_error(tmp_path):
         (Choice(("policy",), {"policy": "green_policy:Nothing"}), "name it as module:Class"),
         (Choice(("policy",), {"policy": "json"}), "expected json to have one node class"),
         (Choice(("policy",)), r"policy cannot be built for replay: .*--set policy.KEY=VALUE"),
-        (Choice(("recorder",)), "recorder cannot be replayed: it publishes nothing"),
+        (Choice(("recorder",)), "recorder cannot be replayed: it opens a new bag; replayable are compositor"),
         (
             Choice(("policy",), {"policy": "green_policy"}),
             "has nothing for policy: they listen to /compositor/image",
@@ -263,6 +267,40 @@ def test_wrong_choices_are_one_clear_error(tmp_path):
     ):
         Replay(stranger, Choice(("policy",)))
     assert "antigravity" not in sys.modules
+
+
+# Which kinds only turn messages into messages, as a person reads their build() and their constructors.
+REPLAYABLE = ("calibration_drive", "collect", "compositor", "counterfactual", "expert", "policy", "safety")
+
+
+def node_kinds():
+    """The class of each kind of node, by the name of its module."""
+    modules = [f"nodes.{file.stem}" for file in sorted(Path(nodes.__file__).parent.glob("*.py"))]
+    values = [value for module in modules for value in vars(importlib.import_module(module)).values()]
+    own = [value for value in values if inspect.isclass(value) and value.__module__ in modules]
+    return {
+        kind.__module__.rsplit(".")[-1]: kind
+        for kind in own
+        if issubclass(kind, Node) and "build" in vars(kind)
+    }
+
+
+def test_a_node_that_opens_something_is_refused_before_it_is_built(tmp_path, monkeypatch):
+    kinds = node_kinds()
+    assert len(kinds) >= 20
+    assert sorted(kind for kind, node in kinds.items() if not node.opens) == sorted(REPLAYABLE)
+    bag = bag_with_launch(tmp_path, {f"my_{kind}": {"module": f"nodes.{kind}"} for kind in kinds})
+    for kind in kinds.keys() - set(REPLAYABLE):
+        with pytest.raises(
+            BagError, match=f"^my_{kind} cannot be replayed: it opens .*; replayable are"
+        ) as told:
+            Replay(bag, Choice((f"my_{kind}",)))
+        named = re.findall(
+            r"[a-z_]+", str(told.value).partition("replayable are ")[2].removesuffix("or your own")
+        )
+        assert sorted(named) == sorted(REPLAYABLE)
+    with pytest.raises(BagError, match="policy cannot be replayed: it opens the motor controller"):
+        Replay(CORNER, Choice(("policy",), {"policy": "nodes.motor"}))
 
 
 def test_a_bag_without_a_launch_file_needs_one(tmp_path):
