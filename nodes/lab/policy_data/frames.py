@@ -8,7 +8,7 @@ steering are in neither: they are not in the expert's control law, and ``recorde
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -95,10 +95,14 @@ def held_out(recording: RecordedFrames) -> np.ndarray[Any, np.dtype[np.int64]]:
     return FrameSet([recording.frames], True, HOLDOUT_EVERY).held_out[:, 1]
 
 
+def view_for_camera(camera: Pinhole, distortion: tuple[float, ...] = ()) -> PolicyView:
+    """View of a camera, with the same crop fraction as for advnerf's camera."""
+    return _cropped_alike(_OWN_VIEW, camera, distortion)
+
+
 def view_for_size(width: int, height: int) -> PolicyView:
     """View for a camera with only a known image size, with the same crop fraction as for advnerf's camera."""
-    camera = Pinhole(width, height, 0.52 * width, 0.52 * width, 0.5 * width, 0.5 * height)
-    return PolicyView(camera, round(height * 24 / 188), round(height * 111 / 188))
+    return view_for_camera(_guessed_camera(width, height))
 
 
 def view_of(log: DriveLog, view: PolicyView) -> PolicyView:
@@ -107,6 +111,36 @@ def view_of(log: DriveLog, view: PolicyView) -> PolicyView:
     return (
         view if (width, height) == (view.camera.width, view.camera.height) else view_for_size(width, height)
     )
+
+
+def _guessed_camera(width: int, height: int) -> Pinhole:
+    return Pinhole(width, height, 0.52 * width, 0.52 * width, 0.5 * width, 0.5 * height)
+
+
+_OWN_VIEW = PolicyView(_guessed_camera(336, 188))
+
+
+def _cropped_alike(view: PolicyView, camera: Pinhole, distortion: tuple[float, ...] = ()) -> PolicyView:
+    """The view of another camera that keeps the same fraction of its image, at the same size of the policy's image."""
+    rows, columns = view.window
+    top_px, height_px = _same_share(rows, view.camera.height, camera.height)
+    left_px, width_px = _same_share(columns, view.camera.width, camera.width)
+    return replace(
+        view,
+        camera=camera,
+        distortion=distortion,
+        crop_top_px=top_px,
+        crop_height_px=height_px,
+        crop_left_px=left_px,
+        crop_width_px=None if view.crop_width_px is None else width_px,
+    )
+
+
+def _same_share(part: slice, whole_px: int, other_px: int) -> tuple[int, int]:
+    """First pixel and number of pixels of the same part of an image of another size."""
+    first_px = min(round(part.start * other_px / whole_px), other_px - 1)
+    count_px = round((part.stop - part.start) * other_px / whole_px)
+    return first_px, max(1, min(count_px, other_px - first_px))
 
 
 def _require_labels(log: DriveLog, expert: Expert | None, labels: Labels) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from advnerf_core.driving.expert import Expert
 from advnerf_core.policies.view import PolicyView
 from calibration.schema import Calibration, CameraCalibration, load_calibration
-from nodes.lab.policy_data.frames import RecordedFrames, frames_of, view_for_size, view_of
+from nodes.lab.policy_data.frames import RecordedFrames, frames_of, view_for_camera, view_for_size, view_of
 from nodes.lab.policy_data.logs import OpenLog
 
 _LEAST_BOUND_RAD = 0.30
@@ -45,7 +45,7 @@ def policy_view(camera: Path | None, logs: Sequence[OpenLog]) -> PolicyView:
     """The policy's view: of the camera's calibration if there is one, or else for the size of the first log's images."""
     calibration: Any = attached_calibration(CameraCalibration, camera, logs, "camera")
     if calibration is not None:
-        return PolicyView(calibration.pinhole, distortion=calibration.distortion)
+        return view_for_camera(calibration.pinhole, calibration.distortion)
     height, width = logs[0].log.first_image().shape[:2]
     return view_for_size(width, height)
 

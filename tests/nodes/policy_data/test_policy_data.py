@@ -1,5 +1,7 @@
 """Foreign logs, error figures against numpy, saliency of a network whose gradient is known, training that resumes."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -10,14 +12,17 @@ from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.learning.recipe import ImitationConfig
 from advnerf_core.policies.policy_file import load_policy
+from advnerf_core.policies.view import PolicyView
+from calibration.schema import CameraCalibration, load_calibration, save_calibration
 from nodes.lab.policy_data import train as training
 from nodes.lab.policy_data.evaluate import compare, predict, saliency
 from nodes.lab.policy_data.frames import frames_of, view_for_size, view_of
 from nodes.lab.policy_data.logs import OpenLog, open_log
-from nodes.lab.policy_data.recordings import recorded_frames
+from nodes.lab.policy_data.recordings import policy_view, recorded_frames
 from nodes.runtime.errors import ConfigError
 
 CHOICE = LogChoice("frame", "angle", 0.5, "right")
+TWIN_CAMERA = Path(__file__).parents[3] / "calibration/twin/camera.yaml"
 EXPERT = Expert(DrivingPath.rounded_square(4.0, 1.1))
 
 
@@ -40,6 +45,27 @@ def test_a_foreign_log_becomes_frames_with_its_own_view(tmp_path):
     assert recording.frames.images[:, 30, 100, 0].tolist() == [20 * n for n in range(8)]
     assert recording.frames.steering_rad == pytest.approx([-0.25 * (n - 4) / 4 for n in range(8)])
     assert np.isnan(recording.frames.states).all()
+
+
+@pytest.mark.parametrize(("width", "height", "first", "last"), [(640, 480, 61, 344), (64, 48, 6, 34)])
+def test_a_calibrated_camera_of_any_size_is_cropped_at_the_fraction_of_our_own(
+    tmp_path, width, height, first, last
+):
+    file = tmp_path / "camera.yaml"
+    own = load_calibration(CameraCalibration, TWIN_CAMERA)
+    save_calibration(own.model_copy(update={"width": width, "height": height}), file)
+    view = policy_view(file, [])
+    image = np.zeros((height, width, 3), np.uint8)
+    image[first:last] = 255  # rows 24 to 135 of 188
+    assert view.image(image).min() == 255
+    assert view.image(255 - image).max() == 0
+    assert (view.camera.fx, view.distortion) == (own.fx, own.distortion)
+
+
+def test_our_own_camera_is_cropped_as_ever():
+    own = load_calibration(CameraCalibration, TWIN_CAMERA)
+    plain = PolicyView(own.pinhole, distortion=own.distortion)
+    assert policy_view(TWIN_CAMERA, []).to_dict() == plain.to_dict()
 
 
 @pytest.mark.parametrize(
