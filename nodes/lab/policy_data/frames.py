@@ -106,11 +106,11 @@ def view_for_size(width: int, height: int) -> PolicyView:
 
 
 def view_of(log: DriveLog, view: PolicyView) -> PolicyView:
-    """A policy's view for the images of a log: those of another size are cropped at the same fraction of the image."""
+    """A policy's view for the images of a log: those of another size are cropped at the same fraction, and not undistorted."""
     height, width = log.first_image().shape[:2]
-    return (
-        view if (width, height) == (view.camera.width, view.camera.height) else view_for_size(width, height)
-    )
+    if (width, height) == (view.camera.width, view.camera.height):
+        return view
+    return _cropped_alike(view, _guessed_camera(width, height))
 
 
 def _guessed_camera(width: int, height: int) -> Pinhole:

@@ -56,6 +56,7 @@ def crop_notes(logs: Iterable[OpenLog], view: PolicyView) -> list[str]:
     found = [(each.name, each.log.first_image().shape) for each in logs]
     return [
         f"{name}: images of {width} x {height} are cropped at the same fraction as the policy's of {wanted[0]} x {wanted[1]}"
+        f"{', and not undistorted' if any(view.distortion) else ''}"
         for name, (height, width, _) in found
         if (width, height) != wanted
     ]

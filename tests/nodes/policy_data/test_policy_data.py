@@ -10,6 +10,7 @@ import torch
 from advnerf_core.data.logs.choice import LogChoice, LogError
 from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.geometry import Pinhole
 from advnerf_core.learning.recipe import ImitationConfig
 from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.policies.view import PolicyView
@@ -18,7 +19,7 @@ from nodes.lab.policy_data import train as training
 from nodes.lab.policy_data.evaluate import compare, predict, saliency
 from nodes.lab.policy_data.frames import frames_of, view_for_size, view_of
 from nodes.lab.policy_data.logs import OpenLog, open_log
-from nodes.lab.policy_data.recordings import policy_view, recorded_frames
+from nodes.lab.policy_data.recordings import crop_notes, policy_view, recorded_frames
 from nodes.runtime.errors import ConfigError
 
 CHOICE = LogChoice("frame", "angle", 0.5, "right")
@@ -66,6 +67,20 @@ def test_our_own_camera_is_cropped_as_ever():
     own = load_calibration(CameraCalibration, TWIN_CAMERA)
     plain = PolicyView(own.pinhole, distortion=own.distortion)
     assert policy_view(TWIN_CAMERA, []).to_dict() == plain.to_dict()
+
+
+def test_images_of_another_size_are_seen_through_the_policy_s_own_window(tmp_path):
+    camera = Pinhole(84, 47, 44.0, 44.0, 42.0, 23.5)
+    view = PolicyView(camera, 10, 20, 40, 30, (0.1, 0.0, 0.0, 0.0), crop_left_px=21, crop_width_px=42)
+    log = write_log(tmp_path)
+    image = np.random.default_rng(0).integers(0, 256, (94, 168, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "0.png"), image[..., ::-1])
+    opened = OpenLog("log", CHOICE, open_log(log, CHOICE), "recorded")
+    seen = recorded_frames(opened, view, None).frames.images
+    expected = cv2.resize(image[20:60, 42:126], (40, 30), interpolation=cv2.INTER_AREA)
+    np.testing.assert_array_equal(seen[0], expected)
+    (note,) = crop_notes([opened], view)
+    assert note.endswith("same fraction as the policy's of 84 x 47, and not undistorted")
 
 
 @pytest.mark.parametrize(
