@@ -31,9 +31,12 @@ from nodes.experiment.plan.sections import ResponseConfig
 from nodes.experiment.show.experiment_world import ExperimentWorld
 from nodes.experiment.show.given import given_in, given_victim
 from nodes.lab.policy_camera import require_camera
+from nodes.lab.policy_data.frames import view_for_camera
 from nodes.lab.worlds.expert_drive import as_path, expert_of
 from nodes.runtime.errors import ConfigError
 
+# The default view fits a driving camera of this size [px]; one that differs by more than the factor needs a view of its own.
+_USUAL, _OTHER_SIZE = (336, 188), 1.25
 PLACED, CALIBRATION = "objects.json", "calibration"
 # Distances in stages were chosen for half a lane of this width [m] and for this speed [m/s]: the simulated junction's.
 _HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
@@ -160,7 +163,8 @@ class Experiment(ExperimentWorld):
         """The policy's view of the driving camera: from the section view, or from the declarations of existing policies.
 
         Raises:
-            ConfigError: The window leaves the camera's image; or a policy was made for another camera, or was not loaded yet.
+            ConfigError: The window leaves the camera's image, or is the default and the camera has another size; or a policy was made
+                for another camera, or was not loaded yet.
         """
         for name in given_in(self.config):
             policy = given_victim(self, name)
@@ -178,12 +182,27 @@ class Experiment(ExperimentWorld):
                     f"got {view.camera}{' with distortion' * any(view.distortion)}; correct its declaration, or the world's camera"
                 )
             return view
+        if "view" not in self.config.model_fields_set:
+            self._require_usual_size()
         try:
             return PolicyView(self.camera, **self.config.view.model_dump())
         except ValueError as error:
             raise ConfigError(
                 f"{self.file}: view: {error}; give the section view the window of the camera's image that is kept"
             ) from error
+
+    def _require_usual_size(self) -> None:
+        size = (self.camera.width, self.camera.height)
+        if all(
+            1 / _OTHER_SIZE < px / usual_px < _OTHER_SIZE for px, usual_px in zip(size, _USUAL, strict=True)
+        ):
+            return
+        alike = view_for_camera(self.camera)
+        raise ConfigError(
+            f"{self.file}: expected a section view for a driving camera of {size[0]} x {size[1]}, because the default window fits "
+            f"{_USUAL[0]} x {_USUAL[1]}; the same part of the image is 'view: {{crop_top_px: {alike.crop_top_px}, "
+            f"crop_height_px: {alike.crop_height_px}}}'"
+        )
 
     @cached_property
     def dynamics(self) -> Dubins | Ackermann:

@@ -111,6 +111,10 @@ def test_every_shipped_experiment_names_its_world(tmp_path: Path) -> None:
             "one reaches into a lane at (0.",
         ),
         ({"view": {"crop_top_px": 100}}, "view: expected a crop inside 336 x 188"),
+        (
+            {"world": {"kind": "junction", "camera": {"width": 640, "height": 480}}},
+            "the same part of the image is 'view: {crop_top_px: 61, crop_height_px: 283}'",
+        ),
         ({"polcy": {}}, "polcy"),
     ],
 )
