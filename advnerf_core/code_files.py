@@ -52,11 +52,18 @@ def entry_point_sha256(entry: EntryPoint) -> str:
 
 
 def module_sha256(module: str) -> str:
-    """Hash of the Python files of a module's package (or folder), and of the versions of the packages that they import."""
+    """Hash of the Python files of a module's package (or folder), and of the versions of the packages that they import.
+
+    Raises:
+        ImportError: No file of the module is found.
+    """
     digest, own, imported = hashlib.sha256(), set[str](), set[str]()
-    for folder, files in _located(module):
+    located = list(_located(module))
+    if not any(files for _, files in located):
+        raise ImportError(f"found no file of a module {module}")
+    for folder, files in located:
         python = [file for file in files if file.suffix == ".py"]
-        _add_files(digest, folder, python)
+        _add_files(digest, folder, python or files)  # a module may be compiled
         own |= {file.relative_to(folder).parts[0].removesuffix(".py") for file in python}
         imported |= {name for file in python for name in _imported(file)}
     for name in sorted(_versions(imported - own)):

@@ -46,12 +46,15 @@ _MANY = 1000
 
 def _say_code(choice: CellChoice) -> None:
     """Print the code that a run of a file will execute; nothing is executed for it."""
+    from advnerf_core.run_module import search_folder_last
     from nodes.experiment.plan.experiment_file import read_experiment_file
     from nodes.lab.plugin_tables import say_code
 
     read = read_experiment_file(choice.file, choice.setting, choice.overrides or [])
     documents = [*read.variants.values()] or [read.document]
-    say_code([each.data for each in documents], choice.file.resolve().parent)
+    folder = choice.file.resolve().parent
+    search_folder_last(str(folder))  # as loading the experiment does
+    say_code([each.data for each in documents], folder)
 
 
 def experiment(

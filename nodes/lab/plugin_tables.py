@@ -14,6 +14,7 @@ from typing import Any
 from advnerf_core.code_files import entry_point_sha256, file_sha256, module_sha256
 from advnerf_core.plugins import absolute_reference, entries_named, is_file_reference, origin_of
 from advnerf_core.policies.load import is_factory
+from advnerf_core.run_module import search_working_folder_last
 
 BUILT_IN = "built in"
 _OURS = ("advnerf_core", "calibration", "hardware", "nodes")
@@ -178,7 +179,11 @@ def _line_of_code(key: str, text: str, folder: Path) -> str:
         key == "module" and text.replace(".", "_").isidentifier()
     )
     if is_module and module.partition(".")[0] not in _OURS:
-        return f"{text} (sha256 {module_sha256(module)[:_DIGITS]})"
+        search_working_folder_last()  # as loading it does
+        try:
+            return f"{text} (sha256 {module_sha256(module)[:_DIGITS]})"
+        except ImportError:
+            return ""  # loading it reports the error
     for table in TABLES.values():
         if key in table.keys:
             for entry in entries_named(text, table.group):

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import sys
+from hashlib import sha256
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -126,3 +129,23 @@ def test_versions_of_imported_packages_count(tmp_path: Path, monkeypatch: pytest
         found.append(module_sha256("my_net"))
     code_files._packages_by_module.cache_clear()
     assert found[0] == found[1] == found[2] != found[3]
+
+
+def test_a_module_without_files_has_no_hash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    in_memory = "a_module_in_memory"
+    monkeypatch.setitem(sys.modules, in_memory, ModuleType(in_memory))
+    (tmp_path / "a_folder_without_files").mkdir()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for module in (in_memory, "sys", "a_module_that_is_not_there", "a_folder_without_files"):
+        with pytest.raises(ImportError, match=f"found no file of a module {module}"):
+            module_sha256(module)
+
+
+def test_a_compiled_module_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    file = tmp_path / f"a_compiled_module{EXTENSION_SUFFIXES[0]}"
+    monkeypatch.syspath_prepend(str(tmp_path))
+    found = []
+    for content in (b"one", b"two"):
+        file.write_bytes(content)
+        found.append(module_sha256("a_compiled_module"))
+    assert len({*found, sha256().hexdigest()}) == 3

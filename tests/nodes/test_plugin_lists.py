@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from hardware.cameras.sources import CAMERAS
 from nodes.cli.main import app
 from nodes.lab.plugin_tables import TABLES, named_code, rows_of
 from nodes.lab.worlds.named import WORLDS
+from tests.support.commands import advnerf
 from tests.support.strangers import install_method, spiral_code, write_spiral
 
 ROOT = Path(__file__).parents[2]
@@ -78,6 +80,26 @@ def test_named_code_is_found_wherever_it_stands(tmp_path: Path, monkeypatch: pyt
     assert whirl.startswith("whirl of stranger-methods 1.0 (sha256 ")
     assert policy.startswith("my_policy:make (sha256 ")
     assert node.startswith("my_policy (sha256 ")
+
+
+def test_a_policy_beside_the_experiment_is_named_with_the_hash_of_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    beside, working = tmp_path / "beside", tmp_path / "working"
+    for folder in (beside, working):
+        folder.mkdir()
+    monkeypatch.chdir(working)
+    (beside / "policy_beside.py").write_text("raise SystemError\n")
+    file = beside / "mine.experiment.yaml"
+    file.write_text(
+        "name: mine\nworld: {kind: junction}\nvictims: {a: {policy: 'policy_beside:make'}, b: {policy: 'policy_nowhere:make'}}\n"
+    )
+    assert advnerf(monkeypatch, "experiment", "run", str(file)) == 2  # there are no paths
+    printed = capsys.readouterr().err
+    content = sha256((beside / "policy_beside.py").read_bytes()).hexdigest()
+    expected = sha256(f"\0policy_beside.py\0{content}".encode()).hexdigest()
+    assert f"executes policy_beside:make (sha256 {expected[:12]})" in printed
+    assert "executes policy_nowhere" not in printed
 
 
 @pytest.fixture
