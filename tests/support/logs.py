@@ -25,15 +25,17 @@ def write_tub_2(
     deleted: Collection[int] = (),
     piloted: Collection[int] = (),
     size: tuple[int, int] = (48, 64),
+    step_ms: int | None = 100,
 ) -> Path:
-    """As ``donkeycar/parts/tub_v2.py`` writes it, five records to a catalog."""
+    """As ``donkeycar/parts/tub_v2.py`` writes it, five records to a catalog; without times if there is no step."""
     (folder / "images").mkdir(parents=True)
     catalogs: dict[str, list[str]] = {}
     for k in range(COUNT):
         name = f"{k}_cam_image_array_.jpg"
         cv2.imwrite(str(folder / "images" / name), picture(k, *size))
         record: dict[str, Any] = {"cam/image_array": name, "user/angle": value(k), "user/throttle": 0.4}
-        record |= {"user/mode": "local" if k in piloted else "user", "_timestamp_ms": 1700000000000 + 100 * k}
+        record |= {"user/mode": "local" if k in piloted else "user"}
+        record |= {} if step_ms is None else {"_timestamp_ms": 1700000000000 + step_ms * k}
         catalogs.setdefault(f"catalog_{k // 5}.catalog", []).append(
             json.dumps(record | {"_index": k, "_session_id": "26-11-26_0"})
         )

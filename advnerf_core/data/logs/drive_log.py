@@ -15,6 +15,7 @@ from advnerf_core.data.image_files import Rgb
 from advnerf_core.data.logs.choice import LogChoice, LogError, Side
 
 Labels = Literal["expert", "recorded"]
+TIMES_GO_BACK = "times that go back or repeat"
 NOWHERE = (math.nan, math.nan, math.nan)
 # Of front wheels: at this angle and above, a value is in degrees, or in another unit.
 _STEEPEST_RAD = 1.0
@@ -115,7 +116,7 @@ class DriveLog:
         controls: All numbers that could be chosen as steering.
         unit: Unit of the steering; None for a log without controls.
         count: Number of images.
-        rate_hz: Images per second while recording; NaN in a log without times.
+        rate_hz: Images per second while recording; NaN in a log without times, and 0 if they go back or repeat.
         poses: Number of measured poses.
         steering: Reads the steering values ``[K]`` in the log's unit.
         frames: Reads the frames in order.
@@ -156,10 +157,11 @@ class DriveLog:
 
 
 def median_rate_hz(times_s: Sequence[float]) -> float:
-    """Images per second without the pauses between drives; NaN without times."""
-    timed = len(times_s) > 1 and bool(np.isfinite(times_s).all())
-    interval_s = float(np.median(np.diff(times_s))) if timed else math.nan
-    return 1.0 / interval_s if interval_s > 0.0 else math.nan
+    """Images per second without the pauses between drives; NaN without times, and 0 if they go back or repeat."""
+    if len(times_s) < 2 or not np.isfinite(times_s).all():
+        return math.nan
+    interval_s = float(np.median(np.diff(times_s)))
+    return 1.0 / interval_s if interval_s > 0.0 else 0.0
 
 
 def chosen_name(wanted: str | None, known: Sequence[str], what: str, path: Path) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.data.image_files import Rgb
 from advnerf_core.data.logs.choice import LogError
-from advnerf_core.data.logs.drive_log import DriveLog, LogFrame
+from advnerf_core.data.logs.drive_log import TIMES_GO_BACK, DriveLog, LogFrame
 from advnerf_core.data.logs.lerobot import (
     ATTACHED,
     DISTURBED,
@@ -97,8 +97,11 @@ def write_lerobot(
 
 def _rate_of(log: DriveLog) -> int:
     if not log.rate_hz >= 0.5:
+        found = (
+            "none" if math.isnan(log.rate_hz) else f"{log.rate_hz:.2g} Hz" if log.rate_hz else TIMES_GO_BACK
+        )
         raise LogError(
-            f"expected the times of the images in {log.path}, it has none; give the images per second with --rate"
+            f"expected times of the images of at least 0.5 Hz in {log.path}, got {found}; give the images per second with --rate"
         )
     return round(log.rate_hz)
 

@@ -298,6 +298,29 @@ def test_the_commands_train_on_several_logs_and_evaluate_held_out_frames(tmp_pat
     assert "CSV file of Udacity's simulator" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("step_ms", "shown", "refused"),
+    [
+        (
+            -100,
+            "times that go back or repeat",
+            "got times that go back or repeat; give the images per second",
+        ),
+        (0, "times that go back or repeat", "got times that go back or repeat; give the images per second"),
+        (None, "no times", "got none; give the images per second"),
+        (4000, "0.2 Hz", "got 0.25 Hz; give the images per second"),
+    ],
+)
+def test_what_is_wrong_with_the_times_of_a_log_is_said(
+    tmp_path, monkeypatch, capsys, step_ms, shown, refused
+):
+    tub = f"{write_tub_2(tmp_path / 'tub', step_ms=step_ms)},steering-full-rad=0.4"
+    assert advnerf(monkeypatch, "log", "info", tub) == 0
+    assert f"12 of 64 x 48, {shown}, cam/image_array" in capsys.readouterr().out
+    assert advnerf(monkeypatch, "log", "export", tub, "-o", str(tmp_path / "out")) == 2
+    assert refused in capsys.readouterr().err
+
+
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared logs are not here")
 def test_the_tub_of_donkeycar_s_tests_is_read_and_a_bag_without_images_refused():
     log = open_log(SHARED / "donkey_tub", LogChoice(steering_full_rad=0.3))
