@@ -394,7 +394,8 @@ class CsvRow:
             return default
         value = float(text) if _is_real(text) else math.nan
         if not math.isfinite(value):
-            advice = "; write a decimal point" if _is_real(text.replace(",", ".", 1)) else "; correct the row"
+            has_comma = "," in text and _is_real(text.replace(",", ".", 1))
+            advice = "; write a decimal point" if has_comma else "; correct the row"
             raise ConfigError(f"{self.place}: {column}: expected a number, got {text!r:.60}{advice}")
         return value
 
@@ -409,11 +410,14 @@ def read_csv(path: Path, columns: Sequence[str] = (), bare: Sequence[str] = ()) 
     reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     rows: list[CsvRow] = []
     problems: list[str] = []
+    began = 1
     try:
         first = next(reader, [])
         is_bare = bool(bare) and len(first) == len(bare) and _is_real(first[-1].strip())
         names = list(bare) if is_bare else [name.strip() for name in first]
+        _require_commas(path, names, columns)
         problems += _header_problems(path, names, columns)
+        began = reader.line_num + 1
         for values in itertools.chain([first] if is_bare else [], reader):
             place = f"{path}:{reader.line_num}"
             if len(values) not in (0, len(names)):
@@ -423,10 +427,22 @@ def read_csv(path: Path, columns: Sequence[str] = (), bare: Sequence[str] = ()) 
                 )
             elif values:
                 rows.append(CsvRow(place, dict(zip(names, values, strict=True))))
+            began = reader.line_num + 1
     except csv.Error as error:
-        problems.append(f"{path}:{reader.line_num}: expected valid CSV: {error}")
+        problems.append(
+            f"{path}:{began}: expected valid CSV: {error}; close each quote at the end of its field, or remove it"
+        )
     raise_problems(problems)
     return rows
+
+
+def _require_commas(path: Path, names: Sequence[str], columns: Sequence[str]) -> None:
+    """Raise for one column that holds other separators, once instead of for each row."""
+    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+        raise ConfigError(
+            f"{path}:1: expected columns {', '.join(columns) or 'with commas between them'}, got {names[0]}; "
+            "separate the columns by commas, and write numbers with a decimal point"
+        )
 
 
 def _header_problems(path: Path, names: list[str], columns: Sequence[str]) -> list[str]:
@@ -436,6 +452,5 @@ def _header_problems(path: Path, names: list[str], columns: Sequence[str]) -> li
     ]
     if any(column not in names for column in columns):
         got = ", ".join(names) or "an empty file"
-        advice = "separate the columns by commas" if ";" in got or "\t" in got else "correct the header"
-        problems.append(f"{path}:1: expected columns {', '.join(columns)}, got {got}; {advice}")
+        problems.append(f"{path}:1: expected columns {', '.join(columns)}, got {got}; correct the header")
     return problems

@@ -174,9 +174,12 @@ def written(tmp_path, text):
         ("a,b\n1,0,2\n3,4\n5\n", r"log\.csv:2: expected 2 fields .* got 3.*\n.*log\.csv:4: expected 2 fields .* got 1"),
         ("a,b,a\n1,2,3\n", r"log\.csv:1: the column a is given twice"),
         ("a;b\n1;2\n", r"log\.csv:1: expected columns a, b, got a;b; separate the columns by commas"),
+        ("a;b\n1;0,2\n3;0,4\n", r"^[^\n]*:1: [^\n]*; separate the columns by commas, and write numbers with a decimal point$"),
+        ("a\tb\n1\t0,2\n", r":1: .*; separate the columns by commas"),
         ("a,c\n1,2\n", r"log\.csv:1: expected columns a, b, got a, c; correct the header"),
         ("", "got an empty file"),
-        ('a,b\n1,"2\n', r"log\.csv:\d: expected valid CSV"),
+        ('a,b\n1,2\n1,"2\n3,4\n', r"log\.csv:3: expected valid CSV: .*; close each quote"),
+        ('a,b\n"x,1\n"y,2\n', r"log\.csv:2: expected valid CSV: .*; close each quote"),
     ],
 )  # fmt: skip
 def test_every_mistake_of_a_csv_file_has_its_line(tmp_path, text, message):
@@ -190,8 +193,8 @@ def test_rows_have_numbers_and_their_place(tmp_path):
     assert (second.values["a"], second.place) == ("x, y", f"{tmp_path / 'log.csv'}:4")
     with pytest.raises(ConfigError, match=r":4: b: expected a number, got '0,5'; write a decimal point"):
         second.number("b")
-    for wrong in ("nan", "1_0", "", "three"):
-        with pytest.raises(ConfigError, match="expected a number"):
+    for wrong in ("nan", "1_0", "", "three", "1e999"):
+        with pytest.raises(ConfigError, match=r"expected a number, got .*; correct the row"):
             read_csv(written(tmp_path, f"a,b\n1,{wrong}\n"))[0].number("b")
 
 
