@@ -26,14 +26,19 @@ def write_tub_2(
     piloted: Collection[int] = (),
     size: tuple[int, int] = (48, 64),
     step_ms: int | None = 100,
+    count: int = COUNT,
 ) -> Path:
     """As ``donkeycar/parts/tub_v2.py`` writes it, five records to a catalog; without times if there is no step."""
     (folder / "images").mkdir(parents=True)
     catalogs: dict[str, list[str]] = {}
-    for k in range(COUNT):
+    for k in range(count):
         name = f"{k}_cam_image_array_.jpg"
-        cv2.imwrite(str(folder / "images" / name), picture(k, *size))
-        record: dict[str, Any] = {"cam/image_array": name, "user/angle": value(k), "user/throttle": 0.4}
+        cv2.imwrite(str(folder / "images" / name), picture(k % COUNT, *size))
+        record: dict[str, Any] = {
+            "cam/image_array": name,
+            "user/angle": value(k % COUNT),
+            "user/throttle": 0.4,
+        }
         record |= {"user/mode": "local" if k in piloted else "user"}
         record |= {} if step_ms is None else {"_timestamp_ms": 1700000000000 + step_ms * k}
         catalogs.setdefault(f"catalog_{k // 5}.catalog", []).append(
@@ -41,7 +46,7 @@ def write_tub_2(
         )
     for name, lines in catalogs.items():
         (folder / name).write_text("\n".join(lines) + "\n")
-    state = {"paths": list(catalogs), "current_index": COUNT, "max_len": 5, "deleted_indexes": list(deleted)}
+    state = {"paths": list(catalogs), "current_index": count, "max_len": 5, "deleted_indexes": list(deleted)}
     rows: list[Any] = [
         ["cam/image_array", "user/angle"],
         ["image_array", "float"],

@@ -28,6 +28,7 @@ _STEERING, _MODE = "user/angle", "user/mode"
 _RECORD = re.compile(r"record_(\d+)\.json")
 _NS_PER_MS = 1_000_000
 _LATEST_MS = 9e12  # in nanoseconds it has 64 bits
+_WIDEST = 2.0  # full steering is 1, which a scaled joystick may exceed; degrees and pulses are far above
 _DELETED, _PILOT = "deleted", "not driven by the user"
 
 
@@ -140,6 +141,8 @@ def _values(records: list[_Record], name: str, images: str) -> NDArray[np.float6
         values.append(float(value) if isinstance(value, int | float) else math.nan)
         if is_recorded and not is_number:
             problems.append(f"{each.place}: {name}: expected a number, got {value!r:.40}; delete the record")
+        elif is_number and name == _STEERING and abs(values[-1]) > _WIDEST:
+            problems.append(f"{each.place}: {name}: expected -1 to 1, got {value:g}; delete the record")
         if not isinstance(each.values.get(images), str):
             problems.append(f"{each.place}: expected the image {images}, got none; delete the record")
     raise_problems(problems)

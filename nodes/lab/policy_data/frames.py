@@ -171,5 +171,5 @@ def _require_size(rgb: Any, view: PolicyView, place: str) -> None:
     if rgb.shape[:2] != (view.camera.height, view.camera.width):
         raise LogError(
             f"{place}: expected an image of {view.camera.width} x {view.camera.height}, got {rgb.shape[1]} x {rgb.shape[0]};"
-            " give the calibration of its camera with --camera"
+            " the images of a log have one size: remove this one"
         )

@@ -40,6 +40,7 @@ class LogFacts:
         looked_at: Images that were looked at.
         joined: Whether a steering value belongs to one of them.
         has_camera: Whether the calibration of the camera is attached.
+        other_size: Where an image has another size than the first; empty if none has.
     """
 
     log: DriveLog
@@ -50,6 +51,7 @@ class LogFacts:
     looked_at: int
     joined: bool
     has_camera: bool
+    other_size: str
 
     def verdicts(self) -> list[Verdict]:
         """What the log allows."""
@@ -85,7 +87,7 @@ class LogFacts:
     def _policy(self) -> Verdict:
         log = self.log
         by_expert = "labels by the expert at the poses" if log.poses and log.labels == "expert" else ""
-        why = self._unusable_images() or ("" if by_expert else self._unusable_steering())
+        why = self._unusable_images() or self.other_size or ("" if by_expert else self._unusable_steering())
         if why:
             return Verdict("learn a policy", False, why)
         few = f"; {log.count} images are few, expect a weak policy" if log.count < _FEW_IMAGES else ""
@@ -109,7 +111,7 @@ class LogFacts:
         )
 
     def _evaluation(self) -> Verdict:
-        if why := self._unusable_images() or self._unusable_steering():
+        if why := self._unusable_images() or self.other_size or self._unusable_steering():
             return Verdict("evaluate a policy", False, why)
         blocks = self.log.count // (16 * HOLDOUT_EVERY)
         part = "" if blocks else "; too short for --held-out"
@@ -117,19 +119,25 @@ class LogFacts:
 
 
 def read_facts(log: DriveLog) -> LogFacts:
-    """Read the controls and the first images of a log.
+    """Read the controls and the images of a log, of a long one the first.
 
     Raises:
-        AdvnerfError: One of the first images is missing or damaged.
+        AdvnerfError: One of these images is missing or damaged.
     """
-    images, looked_at, joined = list[Rgb](), 0, False
+    images, looked_at, joined, other_size = list[Rgb](), 0, False, ""
     ends_s = time.monotonic() + _LOOKING_S
     for frame in log.frames():
         looked_at += 1
         joined |= math.isfinite(frame.steering)
         if len(images) < _LOOKED_AT:
             images.append(frame.image)
-        elif joined or time.monotonic() > ends_s:
+        if not frame.unusable and frame.image.shape != images[0].shape:
+            sizes = [f"{each.shape[1]} x {each.shape[0]}" for each in (images[0], frame.image)]
+            other_size = (
+                f"{frame.place}: expected images of one size, {sizes[0]}, got {sizes[1]}; remove this one"
+            )
+            break
+        if len(images) == _LOOKED_AT and time.monotonic() > ends_s:
             break
     values = log.steering()
     known = values[np.isfinite(values)]
@@ -144,4 +152,5 @@ def read_facts(log: DriveLog) -> LogFacts:
         looked_at,
         joined,
         "camera.yaml" in log.attached(),
+        other_size,
     )

@@ -3,13 +3,15 @@
 import contextlib
 import json
 import math
+import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from advnerf_core.data.logs.choice import LogChoice, LogError, LogRequest
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.errors import AdvnerfError, ConfigError
 from nodes.lab.policy_data.frames import frames_of, view_for_size
 from nodes.lab.policy_data.log_facts import read_facts
 from nodes.lab.policy_data.logs import open_log, open_logs
@@ -260,6 +262,28 @@ def test_a_log_of_one_image_allows_nothing(tmp_path):
     assert [(each.possible, each.why) for each in facts.verdicts()] == [
         (False, "the images are all the same")
     ] * 3
+
+
+def test_an_image_of_another_size_is_found_as_training_finds_it(tmp_path):
+    folder = write_tub_2(tmp_path / "log", count=50)
+    cv2.imwrite(str(folder / "images/40_cam_image_array_.jpg"), np.zeros((60, 80, 3), np.uint8))
+    log = open_log(folder, LogChoice(steering_full_rad=0.4))
+    policy, scene, evaluation = read_facts(log).verdicts()
+    assert (policy.possible, scene.possible, evaluation.possible) == (False, True, False)
+    said = r"catalog_8\.catalog:1: expected images of one size, 64 x 48, got 80 x 60"
+    assert re.search(said, policy.why)
+    with pytest.raises(LogError, match=r"catalog_8\.catalog:1: .*got 80 x 60; .* remove this one"):
+        frames_of(log, view_for_size(64, 48), None, "recorded")
+
+
+@pytest.mark.parametrize(("angle", "refused"), [(7.0, True), (-90.0, True), (1.2, False), (-1.0, False)])
+def test_an_angle_far_outside_of_the_range_of_a_tub_is_refused(tmp_path, angle, refused):
+    folder = write_tub_2(tmp_path / "log")
+    catalog = folder / "catalog_1.catalog"
+    catalog.write_text(catalog.read_text().replace(f'"user/angle": {value(6)}', f'"user/angle": {angle}', 1))
+    said = pytest.raises(ConfigError, match=r"catalog_1\.catalog:2: user/angle: expected -1 to 1, got")
+    with said if refused else contextlib.nullcontext():
+        assert angle in open_log(folder, LogChoice(steering_full_rad=0.1)).steering()
 
 
 def test_a_bag_says_what_it_lacks(tmp_path):
