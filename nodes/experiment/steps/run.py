@@ -25,7 +25,7 @@ from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.live import check_live
 from nodes.experiment.steps.pipeline import stages_of
-from nodes.lab.worlds.named import read_world
+from nodes.lab.worlds.named import known_kind, read_world
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay, StageDisplay
 
@@ -53,6 +53,8 @@ def load_experiment(
 def _load(experiment: Experiment, document: Document) -> Experiment:
     """An experiment without variants, checked against its world, with the digests of its stages that are stored with the code."""
     experiment = experiment.with_given_scene()
+    for section in (("world",), *([("deploy", "world")] if experiment.config.deploy.world else [])):
+        known_kind(document.part(section), experiment.file.parent)
     if experiment.executes or not is_users(experiment.config.world):
         _check_world(experiment, document)
     if given_in(experiment.config):

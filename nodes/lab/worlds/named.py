@@ -10,7 +10,14 @@ from typing import Any, cast
 from pydantic import BaseModel, TypeAdapter
 
 from advnerf_core.documents import Document
-from advnerf_core.plugins import PluginError, absolute_reference, code_sha256, is_file_reference, resolve
+from advnerf_core.plugins import (
+    PluginError,
+    absolute_reference,
+    code_sha256,
+    is_file_reference,
+    require_known,
+    resolve,
+)
 from advnerf_core.strict import is_of_settings, validate
 from hardware.worlds import ENTRY_POINTS
 from hardware.worlds import WORLDS as DRIVEN
@@ -105,11 +112,7 @@ def read_world(document: Document, folder: Path) -> NamedWorld:
     Raises:
         ConfigError: The world is unknown, or its configuration is wrong; with file, line and the valid keys.
     """
-    if not isinstance(document.data, dict) or not isinstance(document.data.get("kind"), str):
-        raise ConfigError(
-            f"{document.place(('kind',))}: expected kind: NAME, the world's name ({', '.join(WORLDS)}, or file.py:Class); got {document.data!r:.80}"
-        )
-    kind = document.data["kind"]
+    kind = known_kind(document, folder)
     try:
         world_class = find_world(kind, folder)
     except PluginError as error:
@@ -120,6 +123,24 @@ def read_world(document: Document, folder: Path) -> NamedWorld:
     if is_file_reference(kind):
         kind = Path(absolute_reference(kind, folder)).name
     return NamedWorld(kind, world_class, config, code)
+
+
+def known_kind(document: Document, folder: Path) -> str:
+    """The name of the world of a section, as in `read_world`; nothing is loaded.
+
+    Raises:
+        ConfigError: The section has no name, or it stands for nothing; with file and line.
+    """
+    if not isinstance(document.data, dict) or not isinstance(document.data.get("kind"), str):
+        raise ConfigError(
+            f"{document.place(('kind',))}: expected kind: NAME, the world's name ({', '.join(WORLDS)}, or file.py:Class); got {document.data!r:.80}"
+        )
+    kind: str = document.data["kind"]
+    try:
+        require_known(kind, "world", WORLDS, ENTRY_POINTS, folder)
+    except PluginError as error:
+        raise ConfigError(f"{document.place(('kind',))}: {error}") from None
+    return kind
 
 
 def find_world(name: str, folder: Path) -> WorldClass:

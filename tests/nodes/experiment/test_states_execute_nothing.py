@@ -1,6 +1,7 @@
 """States and tables of experiments execute no code that a file names: each module here leaves a mark when it is executed."""
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ from nodes.experiment.show.kept_worlds import keep_worlds
 from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
+from nodes.runtime.errors import ConfigError
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 OWN = ("world_warehouse", "my_architecture", "left_objective", "spiral_method")
@@ -83,6 +85,23 @@ def test_a_run_that_was_never_made_has_its_cells_missing(yard):
         if name == "status":
             assert "done" not in shown
             assert "missing" in shown
+
+
+@pytest.mark.parametrize("section", ["world", "deploy.world"])
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("junktion", "did you mean junction?"),
+        ("'nowhere.py:World'", "expected a Python file at"),
+        ("3", "expected kind: NAME"),
+        ("[junction]", "expected kind: NAME"),
+    ],
+)
+def test_a_world_that_stands_for_nothing_is_refused_as_a_run_refuses_it(yard, section, kind, said):
+    for executes in (True, False):
+        with pytest.raises(ConfigError, match=re.escape(said)):
+            load_experiment(yard.file, "tiny", [f"{section}={{kind: {kind}}}"], yard.run, executes)
+    assert yard.executed() == ""
 
 
 def test_keys_without_the_code_are_those_with_it(yard):
