@@ -26,6 +26,7 @@ from nodes.runtime.messages import decode, stamp_ns
 from nodes.runtime.topics import topic as topic_row
 
 _DRIVE, _LABEL = "/policy/drive", "/compositor/attack"
+_COMPOSITOR = "compositor"
 _DEG = 180.0 / np.pi
 Array = NDArray[np.float64]
 
@@ -133,10 +134,17 @@ def retro_attack(bag: Path, attack: Path, choice: Choice) -> RetroAttack:
     Args:
         bag: Bag folder or file, with camera images and poses.
         choice: Nodes to run. ``compositor`` gets the attack; overrides select the policy.
+
+    Raises:
+        BagError: The compositor or a policy is not among the nodes, or no image got a command.
     """
-    clean, _, clean_digest = _steering(bag, choice, "compositor.attack=null")
+    if _COMPOSITOR not in choice.nodes:
+        raise BagError(
+            f"expected the node {_COMPOSITOR}, which draws the attack, among --nodes, got {', '.join(choice.nodes) or 'none'}; add it"
+        )
+    clean, _, clean_digest = _steering(bag, choice, f"{_COMPOSITOR}.attack=null")
     attacked, labels, digest = _steering(
-        bag, choice, f"compositor.attack={json.dumps(str(attack.resolve()))}"
+        bag, choice, f"{_COMPOSITOR}.attack={json.dumps(str(attack.resolve()))}"
     )
     stamps = sorted(clean.keys() & attacked.keys())
     if not stamps:
@@ -194,6 +202,10 @@ def _steering(
     with Replay(
         bag, Choice(choice.nodes, choice.replacements, choice.launch, (*choice.overrides, setting))
     ) as replay:
+        if _DRIVE not in replay.made_topics:
+            raise BagError(
+                f"expected a policy, which publishes {_DRIVE}, among --nodes, got {', '.join(replay.names)}; add it"
+            )
         for made in replay:
             if made.topic not in (_DRIVE, _LABEL):
                 continue

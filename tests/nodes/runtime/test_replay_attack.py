@@ -121,6 +121,14 @@ def test_retro_attack_on_the_command_line(clean_drive, tmp_path, capsys):
             ["--nodes", "compositor", "--golden", "nothing.mcap"],
             "expected a golden bag at nothing.mcap, found none; write it with",
         ),
+        (
+            ["--nodes", "policy", "--attack", str(CORNER)],
+            "expected the node compositor, which draws the attack, among --nodes, got policy; add it",
+        ),
+        (
+            ["--nodes", "compositor", "--attack", str(CORNER)],
+            "expected a policy, which publishes /policy/drive, among --nodes, got compositor; add it",
+        ),
         ([], "expected at least one node to replay"),
     ],
 )
