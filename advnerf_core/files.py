@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from advnerf_core.places import require_utf8
+from advnerf_core.places import PlaceError, require_utf8
 
 
 def write_atomically(path: Path, data: str | bytes) -> None:
@@ -27,6 +27,33 @@ def write_atomically(path: Path, data: str | bytes) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def refuse_overwriting(inputs: Iterable[Path | None], outputs: Iterable[Path]) -> None:
+    """Refuse outputs that would replace an input, under whatever name, a file in an input folder, a folder, or another output.
+
+    Args:
+        inputs: Files and folders that the user gave; None for an option that was not given.
+        outputs: Files that will be written.
+
+    Raises:
+        PlaceError: An output is one of these.
+    """
+    given = [each.resolve() for each in inputs if each is not None]
+    taken: set[Path] = set()
+    for output in outputs:
+        file = output.resolve()
+        if file.is_dir():
+            raise PlaceError(f"expected a file to write, got the folder {output}; add a file name")
+        if file in given or (file.exists() and any(file.is_relative_to(each) for each in given)):
+            raise PlaceError(
+                f"expected an output that replaces nothing that was given, but {output} would be overwritten; choose another --output"
+            )
+        if file in taken:
+            raise PlaceError(
+                f"expected names for two files to write, but both would be {output}; give --output another suffix"
+            )
+        taken.add(file)
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from advnerf_core.files import write_atomically
+from advnerf_core.files import refuse_overwriting, write_atomically
 from calibration.camera_to_car import MountFit
 from calibration.display_colour import DisplayFit
 from calibration.intrinsics import IntrinsicsFit
@@ -23,13 +23,19 @@ from calibration.vehicle_response import ResponseFit
 _CHANNELS = ("tab:red", "tab:green", "tab:blue")
 
 
+def plot_beside(path: Path) -> Path:
+    """Path of the plot of a calibration file."""
+    return path.with_suffix(".png")
+
+
 def save_with_plot(calibration: Calibration, path: Path, draw: Callable[[Figure], None]) -> Path:
     """Write a calibration file and its plot, each atomically. Returns the path of the plot."""
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     draw(figure)
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
-    picture = path.with_suffix(".png")
+    picture = plot_beside(path)
+    refuse_overwriting((), (picture, path))
     try:
         write_atomically(picture, buffer.getvalue())
     except OSError as error:

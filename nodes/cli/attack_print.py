@@ -134,10 +134,14 @@ def attack_measure(
     """Measure a print where it hangs: true size, pose, flatness, colours, and what it does to the victim."""
     from advnerf_core.attack.artifact import load_attack
     from advnerf_core.attack.printing.record import load_record
-    from nodes.lab.wizards.prints import KnownLength, measure, write_measured
+    from advnerf_core.files import refuse_overwriting
+    from nodes.lab.wizards.prints import KnownLength, measure, measured_files, write_measured
 
+    target = output or source.with_name(f"{source.stem}.measured.json")
     record = load_record(printed)
-    attack = load_attack(attack_file or printed.parent / record.attack_file)
+    attack_file = attack_file or printed.parent / record.attack_file
+    refuse_overwriting((source, printed, camera, card, attack_file, request), measured_files(target))
+    attack = load_attack(attack_file)
     known = KnownLength(None if card is None else load_record(card), distance_m, width_m, _pose(car))
     found = measure(source, record, attack, camera, known)
     rows = table("of the print", "measured")
@@ -148,7 +152,6 @@ def attack_measure(
     if request is not None:
         effect = _effect(request, attack, record, found)
         print(effect.text)
-    target = output or source.with_name(f"{source.stem}.measured.json")
     print(f"written: {', '.join(map(str, write_measured(found, effect, target)))}")
 
 

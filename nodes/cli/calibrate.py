@@ -13,7 +13,7 @@ from nodes.cli import calibrate_display as cli_calibrate_display
 from nodes.cli import calibrate_printer as cli_calibrate_printer
 from nodes.cli.calibrate_display import Output
 from nodes.cli.calibrate_printer import Lens
-from nodes.lab.wizards.output import save_and_print
+from nodes.lab.wizards.output import keep_inputs, save_and_print
 from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import RunDir
 
@@ -121,6 +121,7 @@ def intrinsics(
 
     if model not in ("none", "two-radial", "three-radial"):
         raise CalibrationError(f"expected --model none, two-radial or three-radial; got {model!r}")
+    keep_inputs(output, source)
     detector = BoardDetector(options.board())
     views, size, seen = [], (0, 0), 0
     for index, (name, image) in enumerate(read_pictures(_source(source, live, (IMAGES,), output))):
@@ -171,6 +172,7 @@ def camera_to_car(
     from nodes.lab.wizards.bags import CAR, IMAGES, still_views
     from nodes.lab.wizards.lens import load_lens
 
+    keep_inputs(output, source, lens, pattern)
     detector = BoardDetector(options.board())
     tracked = None if untracked else board_topic
     bag = _source(source, live, tuple(t for t in (IMAGES, CAR, tracked) if t), output)
@@ -203,6 +205,7 @@ def mocap_to_scene(
     from calibration.mocap_to_scene import place_scene
     from calibration.plots import scene_plot
 
+    keep_inputs(output, scene, mocap)
     one, two = (
         {frame.path.name: frame.T_world_from_camera for frame in load_transforms(file).frames}
         for file in (scene, mocap)
@@ -231,6 +234,7 @@ def vehicle(
     from calibration.vehicle_response import fit_response, vehicle_calibration
     from nodes.lab.wizards.bags import CAR, SENT, read_drive
 
+    keep_inputs(output, source, before)
     old = load_calibration(VehicleCalibration, before)
     drive = read_drive(_source(source, live, (CAR, SENT), output))
     gains = fit_gains(drive, wheelbase_m or old.wheelbase_m)
@@ -269,6 +273,7 @@ def time_offset(
     from calibration.time_offset import fit_offset, image_turns
     from nodes.lab.wizards.bags import CAR, IMAGES, read_frames, read_poses
 
+    keep_inputs(output, source, camera)
     known = load_calibration(CameraCalibration, camera)
     bag = _source(source, live, (IMAGES, CAR), output)
     poses = read_poses(bag, CAR)

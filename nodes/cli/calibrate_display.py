@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from nodes.lab.wizards.output import save_and_print
+from nodes.lab.wizards.output import keep_inputs, save_and_print
 from nodes.runtime.terminal import RunDir
 
 Output = Annotated[
@@ -74,6 +74,7 @@ def display(
     from calibration.plots import display_plot
     from nodes.lab.wizards.bags import read_shown
 
+    keep_inputs(output, folder)
     if screen is not None or twin is not None:
         _show_colours(folder, screen, twin, run_dir)
     fit = fit_display(*read_shown(folder))

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from nodes.cli.calibrate_display import Output
-from nodes.lab.wizards.output import save_and_print
+from nodes.lab.wizards.output import keep_inputs, save_and_print
 
 Lens = Annotated[
     Path, typer.Option("--lens", help="Lens file (car calibrate intrinsics) or camera file.", exists=True)
@@ -62,6 +62,7 @@ def printer(
     from nodes.lab.wizards.bags import read_picture
     from nodes.lab.wizards.lens import load_lens
 
+    keep_inputs(output, photo, chart, lens)
     fit = fit_printer(read_picture(photo), load_lens(lens), load_record(chart))
     save_and_print(printer_calibration(fit, conditions), output, lambda figure: display_plot(figure, fit))
     print(f"a search prints within this range with\nface: {{display: {output}}}")

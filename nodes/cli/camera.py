@@ -105,6 +105,7 @@ def camera_factory(
     height: Annotated[int, typer.Option(min=1, help="Height of the delivered images [px].")] = 188,
 ) -> None:
     """Write the calibration file of a ZED's rectified left eye from its factory calibration."""
+    from advnerf_core.files import refuse_overwriting
     from calibration.schema import save_calibration
     from hardware.cameras.zed.calibration import EYE_SIZES
     from nodes.lab.camera_tools import CameraToolError, calibration_from_zed
@@ -116,6 +117,7 @@ def camera_factory(
         raise CameraToolError(
             f"expected at most {largest[0]} x {largest[1]} in mode {mode}; got {width} x {height}. Reduce --width and --height"
         )
+    refuse_overwriting((factory, mount), (output,))
     found = calibration_from_zed(factory, mode, (width, height), mount)
     save_calibration(found, output)
     print(f"fx {found.fx:.2f}, fy {found.fy:.2f}, cx {found.cx:.2f}, cy {found.cy:.2f}: saved {output}")

@@ -56,6 +56,7 @@ def replay(
     plot: Annotated[Path | None, typer.Option(help="With --attack: plot the steering (.png).")] = None,
 ) -> None:
     """Replay a bag through nodes in lockstep. The same bag gives the same bytes. With --attack, compare the steering."""
+    from advnerf_core.files import refuse_overwriting
     from nodes.runtime.errors import BagError
 
     if attack is None and (json_file or plot):
@@ -72,6 +73,8 @@ def replay(
         raise BagError(
             "expected --topics and --tolerance only with --golden FILE; add --golden or remove them"
         )
+    written = (json_file, plot, golden if update_golden else None)
+    refuse_overwriting((bag, launch, attack), [each for each in written if each is not None])
     choice = _choice(
         nodes or (_RETRO_NODES if attack else ""), replace or [], launch, policy, overrides or []
     )

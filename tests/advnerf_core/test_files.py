@@ -6,8 +6,9 @@ import torch
 from safetensors.numpy import load, save
 
 from advnerf_core.fields.hash_grid import HashGridConfig
-from advnerf_core.files import with_sorted_header, write_atomically
+from advnerf_core.files import refuse_overwriting, with_sorted_header, write_atomically
 from advnerf_core.geometry import Pinhole
+from advnerf_core.places import PlaceError
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.policies.view import PolicyView
@@ -48,3 +49,25 @@ def test_policies_and_scenes_are_the_same_bytes_when_they_are_saved_again(tmp_pa
         for name, contents in written.items():
             contents.add((tmp_path / name).read_bytes())
     assert {name: len(contents) for name, contents in written.items()} == {"policy": 1, "scene": 1}
+
+
+def test_nothing_that_was_given_is_overwritten(tmp_path):
+    photo, folder, other = tmp_path / "photo.png", tmp_path / "bag", tmp_path / "other.png"
+    photo.touch()
+    folder.mkdir()
+    (folder / "part.mcap").touch()
+    (tmp_path / "link.png").symlink_to(photo)
+    for outputs, said in [
+        ([photo], "would be overwritten"),
+        ([folder / ".." / "photo.png"], "would be overwritten"),
+        ([tmp_path / "link.png"], "would be overwritten"),
+        ([other, photo], "would be overwritten"),
+        ([folder / "part.mcap"], "would be overwritten"),
+        ([folder], "got the folder"),
+        ([other, tmp_path / "." / "other.png"], "two files"),
+    ]:
+        with pytest.raises(PlaceError, match=said):
+            refuse_overwriting((photo, None, folder), outputs)
+    with pytest.raises(PlaceError, match="would be overwritten"):
+        refuse_overwriting([tmp_path / "link.png"], [photo])
+    refuse_overwriting((photo, None, folder), (other, folder / "new.json"))

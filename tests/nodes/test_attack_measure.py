@@ -226,3 +226,17 @@ def test_a_drive_gives_size_pose_flatness_and_the_effect_where_it_hangs(call, se
     assert effect["at_measured_pose"]
     assert "where it hangs" in said
     assert min(effect[key] for key in ("clean_m", "nominal_m", "print_m")) >= 0.0
+
+
+def test_no_input_is_overwritten(call, folder):
+    call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 50)
+    (folder / "photo.png").touch()
+    before = {file: file.read_bytes() for file in folder.iterdir()}
+    command = (
+        "attack", "measure", folder / "photo.png", "--print", folder / "p.print.json", "--camera", folder / "lens.yaml", "-o",
+    )  # fmt: skip
+    given = ("photo.png", "photo.json", "p.print.json", "lens.yaml", "a.attack.safetensors")
+    for output, refusal in [*((name, "would be overwritten") for name in given), ("new.png", "two files")]:
+        code, said = call(*command, folder / output)
+        assert (code, refusal in said) == (2, True), said
+    assert {file: file.read_bytes() for file in folder.iterdir()} == before

@@ -6,6 +6,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+import typer
 import yaml
 
 from advnerf_core.data.transforms_write import write_transforms
@@ -26,6 +27,7 @@ from hardware.worlds.lab.config import LabConfig
 from nodes.bags.reader import read_info
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
+from nodes.cli.calibrate import app
 from nodes.lab.wizards.bags import read_shown, still_views
 from nodes.lab.wizards.live import record_live
 from nodes.lab.wizards.screen import show_and_watch
@@ -459,3 +461,40 @@ def test_a_board_to_print(tmp_path, capsys):
     found = BoardDetector(Board(7, 5, 0.04, 0.03)).find(np.pad(printed, 100, constant_values=255))
     assert len(found.pixels) == 24
     assert "280 x 200 mm" in capsys.readouterr().out
+
+
+# What each command reads: arguments have no name, and are in their order.
+GIVEN = {
+    "intrinsics": [""],
+    "camera-to-car": ["", "--lens", "--pattern"],
+    "mocap-to-scene": ["", " "],
+    "vehicle": ["", "--before"],
+    "time-offset": ["", "--camera"],
+    "display": [""],
+    "printer": ["", "--chart", "--lens"],
+}
+
+
+@pytest.mark.parametrize("name", GIVEN)
+def test_neither_the_file_nor_its_plot_replaces_an_input(tmp_path, capsys, name):
+    words, files = [], [tmp_path / f"folder{k}" / "given.png" for k in range(len(GIVEN[name]))]
+    for option, file in zip(GIVEN[name], files, strict=True):
+        file.parent.mkdir()
+        file.write_text(option)
+        words += [*option.split(), file.parent if name == "display" else file]
+    for file in files:
+        for output in (file, file.with_suffix(".yaml")):
+            assert run("car", "calibrate", name, *words, "-o", output) == 2
+            assert "would be overwritten" in capsys.readouterr().err
+    assert {file: file.read_text() for file in tmp_path.rglob("given.*")} == dict(
+        zip(files, GIVEN[name], strict=True)
+    )
+
+
+def test_all_commands_that_write_a_calibration_are_among_these():
+    commands = typer.main.get_command(app).commands
+    helps = {
+        name: next(each.help for each in found.params if each.name == "output")
+        for name, found in commands.items()
+    }
+    assert {name for name, text in helps.items() if "YAML" in text} == set(GIVEN)

@@ -14,6 +14,14 @@ if TYPE_CHECKING:
     from calibration.schema import Calibration
 
 
+def keep_inputs(output: Path, *inputs: Path | None) -> None:
+    """Refuse an output that would overwrite an input with the calibration file or its plot, before any work."""
+    from advnerf_core.files import refuse_overwriting
+    from calibration.plots import plot_beside
+
+    refuse_overwriting(inputs, (output, plot_beside(output)))
+
+
 def save_and_print(calibration: Calibration, output: Path, draw: Callable[[Figure], None]) -> None:
     """Write the calibration file and its plot, and print the residuals of the fit."""
     from calibration.plots import save_with_plot

@@ -129,6 +129,11 @@ def measure(
     return _measure_drive(source, record, sheet, load_calibration(CameraCalibration, camera))
 
 
+def measured_files(path: Path) -> tuple[Path, Path]:
+    """The JSON file of a measurement, and the picture of the print beside it."""
+    return path, path.with_suffix(".png")
+
+
 def write_measured(found: MeasuredPrint, effect: PlainData | None, path: Path) -> list[Path]:
     """Write a measurement as JSON, and beside it pictures of the print: nominal, as seen, and in even white light.
 
@@ -139,7 +144,7 @@ def write_measured(found: MeasuredPrint, effect: PlainData | None, path: Path) -
     write_json(path, data)
     if found.colours is None:
         return [path]
-    picture = path.with_suffix(".png")
+    picture = measured_files(path)[1]
     row = np.concatenate([found.colours.nominal, found.colours.seen, found.colours.unlit], axis=1)
     write_image(picture, row.repeat(4, axis=0).repeat(4, axis=1))
     return [path, picture]
