@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.attack.printing.frame import CHART_SET, frame_around
 from advnerf_core.attack.printing.pdf import Page, PdfDocument
-from advnerf_core.attack.printing.poster import MM_PER_M, Printable, PrintError, pixels_of
+from advnerf_core.attack.printing.poster import MM_PER_M, Printable, pixels_of
 from advnerf_core.attack.printing.record import PrintRecord, record_of
 from advnerf_core.attack.printing.tiles import PAPERS_MM
 from calibration.degeneracy import DegenerateDataError
@@ -83,10 +83,8 @@ def fit_printer(rgb: Rgb, lens: Intrinsics, record: PrintRecord) -> DisplayFit:
         DegenerateDataError: The photograph does not show the chart well enough.
         PoorFitError: The chart is bent, or its colours do not fit.
     """
-    if record.patches is None:
-        raise PrintError(
-            "expected the record of a chart, got that of a poster; print 'car calibrate printer-chart'"
-        )
+    record.require("chart")
+    assert record.patches is not None, "a chart has patches"
     markers = find_markers(rgb, lens, record.markers, "the chart")
     if not markers:
         raise DegenerateDataError(

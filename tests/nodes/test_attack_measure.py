@@ -124,6 +124,8 @@ def test_a_chart_beside_it_is_a_card(call, folder):
     assert (found["size_m"], found["size_from"]) == (pytest.approx((0.392, 0.392), rel=0.005), "a card")
     assert np.array(found["T_camera_from_face"]) == pytest.approx(T, abs=0.006)
     assert call(*command, "--card", folder / "chart.print.json", "--width", 0.4)[0] == 2
+    code, said = call(*command, "--card", folder / "p.print.json")  # it is 2 % smaller than it says
+    assert (code, "expected the record of a chart, got that of a poster" in said) == (2, True)
 
 
 @pytest.fixture

@@ -55,6 +55,17 @@ class PrintRecord(PlainData):
         first = min(self.markers)
         return MarkerFrame(self.picture_m, float(np.ptp(self.markers[first][:, 1])), first)
 
+    def require(self, kind: Literal["poster", "chart"]) -> None:
+        """Refuse the record of the other kind of print.
+
+        Raises:
+            PrintError: It is of the other kind.
+        """
+        if self.kind != kind:
+            raise PrintError(
+                f"expected the record of a {kind}, got that of a {self.kind}; give the {SUFFIX} that was written beside the {kind}"
+            )
+
     def __post_init__(self) -> None:
         sizes = np.array([*self.picture_m, *self.sheet_m])
         if not (np.isfinite(sizes).all() and (sizes > _LEAST_M).all() and (sizes < _LARGEST_M).all()):

@@ -47,7 +47,7 @@ class KnownLength:
     """What is known of a photograph beside its pixels; at most one of the first three, which give its metres.
 
     Attributes:
-        card: Record of a print of true size in the plane of the print, such as the colour chart.
+        card: Record of a colour chart of true size in the plane of the print; a poster cannot vouch for its own size.
         distance_m: Distance from the lens to the middle of the print [m].
         width_m: Width of the print's picture, by ruler [m].
         car: Pose of the car that took the photograph: x [m], y [m], yaw [rad].
@@ -64,6 +64,8 @@ class KnownLength:
             raise CalibrationError(
                 f"expected one of --card, --distance and --width, got {len(given)}; give the surest"
             )
+        if self.card is not None:
+            self.card.require("chart")
 
     def scale_of(self, pose: PrintPose, nominal_m: tuple[float, float]) -> tuple[str, float, float] | None:
         """What gives the size, true over nominal size, and its standard deviation; None where nothing does."""
@@ -156,10 +158,7 @@ def printed_sheet(record: PrintRecord, attack: AttackFile) -> Printable:
     Raises:
         PrintError: The record belongs to another poster.
     """
-    if record.kind != "poster":
-        raise PrintError(
-            "expected the record of a poster, got that of a chart; give the poster's .print.json"
-        )
+    record.require("poster")
     if record.attack_id != attack.attack_id:
         raise PrintError(
             f"expected attack {record.attack_id}, which was printed, got {attack.attack_id}; give its file with --attack"
