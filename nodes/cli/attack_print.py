@@ -54,15 +54,20 @@ def attack_print(
     """Write a face's or panel's texture at its true size: a PDF in tiles with marks to cut and glue, or one PNG."""
     from advnerf_core.attack.artifact import load_attack
     from advnerf_core.attack.printing.poster import poster_of
-    from nodes.experiment.node.printed import write_poster, write_record
+    from advnerf_core.attack.printing.record import save_record
+    from advnerf_core.files import refuse_overwriting
+    from nodes.experiment.node.printed import record_beside, write_poster
 
     poster = poster_of(load_attack(file), name, size_m)
     if markers:
         poster = poster.with_markers(None if marker_mm is None else marker_mm / 1000.0)
     target = output or file.with_name(f"{file.name.partition('.')[0]}.poster.pdf")
+    refuse_overwriting((file,), (target,))
+    beside = record_beside(poster, file, target, dpi) if markers else None
     print(write_poster(poster, target, paper, dpi, margin_mm, overlap_mm))
-    if markers:
-        print(f"written: {write_record(poster, file, target, dpi)}, the sizes for 'advnerf attack measure'")
+    if beside is not None:
+        save_record(*beside)
+        print(f"written: {beside[1]}, the sizes for 'advnerf attack measure'")
 
 
 def attack_measure(

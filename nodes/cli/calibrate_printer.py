@@ -24,19 +24,20 @@ def printer_chart(
 ) -> None:
     """Write a chart of colours to print, with markers and a JSON file of their sizes, for ``car calibrate printer``."""
     from advnerf_core.attack.printing.poster import PrintError, png_bytes
-    from advnerf_core.attack.printing.record import SUFFIX, save_record
+    from advnerf_core.attack.printing.record import SUFFIX, require_free, save_record
     from advnerf_core.files import write_atomically
     from calibration.print_chart import chart_pdf, chart_record, make_chart
 
     chart = make_chart(paper)
     if output.suffix.lower() not in (".pdf", ".png"):
         raise PrintError(f"expected a .pdf or .png file to write, got {output}; correct --output")
+    record, beside = chart_record(chart, dpi), output.with_suffix(SUFFIX)
+    require_free(beside, record)
     pdf = output.suffix.lower() == ".pdf"
     write_atomically(output, chart_pdf(chart, paper, dpi) if pdf else png_bytes(chart, dpi))
-    record = output.with_suffix(SUFFIX)
-    save_record(chart_record(chart, dpi), record)
+    save_record(record, beside)
     width, height = chart.sheet_mm
-    print(f"written: {output}, {width:.0f} x {height:.0f} mm, and {record}; print it as you print posters")
+    print(f"written: {output}, {width:.0f} x {height:.0f} mm, and {beside}; print it as you print posters")
 
 
 def printer(

@@ -100,3 +100,35 @@ def test_mistakes_are_told_in_one_line(printed, arguments, message):
     code, said = printed(*arguments)
     assert code == 2
     assert message in said
+
+
+def test_the_record_of_another_print_is_never_replaced(printed, file):
+    poster, record = file.parent / "p.png", file.parent / "p.print.json"
+    assert printed("-o", poster, "--dpi", 40)[0] == 0
+    before = record.read_text(), poster.read_bytes()
+    for output in ("p.png", "p.pdf"):
+        code, said = printed("-o", file.parent / output, "--dpi", 40, "--marker-mm", 60)
+        assert (code, "record of another print" in said) == (2, True)
+    assert (record.read_text(), poster.read_bytes()) == before
+    assert not (file.parent / "p.pdf").exists()
+    assert printed("-o", file.parent / "p.pdf", "--dpi", 50)[0] == 0  # the same print, in another file
+    record.write_text("{}")
+    assert printed("-o", poster, "--dpi", 40)[0] == 2
+
+
+def test_nor_that_of_another_chart(monkeypatch, tmp_path, capsys):
+    def chart(*arguments):
+        monkeypatch.setattr(
+            sys, "argv", ["advnerf", "car", "calibrate", "printer-chart", *map(str, arguments)]
+        )
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return ended.value.code
+
+    assert chart("-o", tmp_path / "chart.png", "--dpi", 50) == 0
+    before = (tmp_path / "chart.print.json").read_text()
+    assert chart("-o", tmp_path / "chart.pdf", "--dpi", 50, "--paper", "a3") == 2
+    assert "record of another print" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.glob("*.pdf")] == []
+    assert (tmp_path / "chart.print.json").read_text() == before
+    assert chart("-o", tmp_path / "chart.pdf", "--dpi", 60) == 0

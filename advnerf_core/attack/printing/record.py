@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -114,6 +114,18 @@ def poster_record(poster: Poster, attack_file: Path, folder: Path, dpi: float) -
     seen_from = Path(os.path.relpath(attack_file.resolve(), folder.resolve())).as_posix()
     about = {"attack_id": poster.attack.attack_id, "attack_file": seen_from, "object": poster.name}
     return record_of(poster.frame, dpi, kind="poster", **about)
+
+
+def require_free(path: Path, record: PrintRecord) -> None:
+    """Refuse to replace the record of another print, which could not be measured without it; resolution is no difference.
+
+    Raises:
+        PrintError: The path holds another record, or something else.
+    """
+    if path.exists() and replace(load_record(path), dpi=record.dpi).to_dict() != record.to_dict():
+        raise PrintError(
+            f"expected no record of another print at {path}, which is measured by it; choose another --output, or remove that file"
+        )
 
 
 def save_record(record: PrintRecord, path: Path) -> None:

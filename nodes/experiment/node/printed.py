@@ -8,7 +8,7 @@ from pathlib import Path
 from advnerf_core.attack.artifact import AttackFile, load_attack
 from advnerf_core.attack.printing.pages import pdf_bytes
 from advnerf_core.attack.printing.poster import Poster, PrintError, png_bytes
-from advnerf_core.attack.printing.record import SUFFIX, poster_record, save_record
+from advnerf_core.attack.printing.record import SUFFIX, PrintRecord, poster_record, require_free
 from advnerf_core.attack.printing.sheet import metres
 from advnerf_core.attack.printing.tiles import Paper, layout_of
 from advnerf_core.files import write_atomically
@@ -62,11 +62,16 @@ def write_poster(
     return f"written: {target}, {size}, {pages} and an overview; print at 100 %, no fit to page"
 
 
-def write_record(poster: Poster, attack_file: Path, printed: Path, dpi: float) -> Path:
-    """Write the sizes and markers of a printed poster beside its file; the record's path."""
+def record_beside(poster: Poster, attack_file: Path, printed: Path, dpi: float) -> tuple[PrintRecord, Path]:
+    """Sizes and markers of a poster, and the path beside its file where they are written.
+
+    Raises:
+        PrintError: The record of another print is there.
+    """
     path = printed.with_suffix(SUFFIX)
-    save_record(poster_record(poster, attack_file, path.parent, dpi), path)
-    return path
+    record = poster_record(poster, attack_file, path.parent, dpi)
+    require_free(path, record)
+    return record, path
 
 
 def print_attacks(files: Sequence[Path]) -> None:
