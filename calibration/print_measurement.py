@@ -13,6 +13,8 @@ from calibration.print_drive import PlacedPrint
 from calibration.print_pose import PrintPose
 
 CARD, DISTANCE, WIDTH, POSES = "a card", "the distance", "the width", "the camera's poses"
+# Beyond what a hand that holds the camera tilts it; and a print that faces up or down has no upright.
+_UPRIGHT_DEG, _LEAST_UPRIGHT = 10.0, 0.5
 _NO_SIZE = "unknown: one photograph gives the pose in units of the nominal size; give --card, --distance or --width, or a bag with the car's poses"
 
 
@@ -68,6 +70,15 @@ class PrintMeasurement(PlainData):
         return float(np.sqrt(self.size_m[0] * self.size_m[1] / (self.nominal_m[0] * self.nominal_m[1])))
 
     @property
+    def turned_deg(self) -> float | None:
+        """Clockwise turn in its own plane [deg], against the vertical of the world if that is known, else of the photograph; None if it lies."""
+        if self.T_world_from_face is not None:
+            up, right = np.asarray(self.T_world_from_face)[2, [2, 1]]
+        else:
+            up, right = -np.asarray(self.T_camera_from_face)[1, [2, 1]]
+        return float(np.degrees(np.arctan2(-right, up))) if np.hypot(up, right) > _LEAST_UPRIGHT else None
+
+    @property
     def lines(self) -> list[tuple[str, str]]:
         """Quantities and their values as text."""
         rows = [("markers", self._markers()), ("size", self._size())]
@@ -91,6 +102,8 @@ class PrintMeasurement(PlainData):
                     f"x {T[0, 3]:.3f}, y {T[1, 3]:.3f}, z {T[2, 3]:.3f} m, faces {yaw_deg:.1f} degrees, {up_deg:+.1f} up",
                 )
             )
+        if (turned := self._turned()) is not None:
+            rows.append(("turned", turned))
         rows.append(("direction within", f"{self.angle_sd_deg:.2f} degrees (standard deviation)"))
         rows.append(("flatness", self._flatness()))
         rows.append(("colours", self._colours()))
@@ -111,6 +124,15 @@ class PrintMeasurement(PlainData):
             f"{width:.4f} x {height:.4f} m ({100 * (width / w - 1):+.2f} % and {100 * (height / h - 1):+.2f} % of nominal), by {self.size_from}, "
             f"within {100 * self.size_sd:.2f} %"
         )
+
+    def _turned(self) -> str | None:
+        """The turn of a print that does not hang upright; None if it does."""
+        turned_deg = self.turned_deg
+        if turned_deg is None or abs(turned_deg) < _UPRIGHT_DEG:
+            return None
+        way = "clockwise" if turned_deg > 0.0 else "anticlockwise"
+        of = "" if self.T_world_from_face is not None else " of the photograph"
+        return f"by {abs(turned_deg):.0f} degrees {way} against the horizontal{of}: not as it was searched, which is upright; hang it upright"
 
     def _flatness(self) -> str:
         off = f"{self.flatness_mm:.1f} mm from a plane (standard deviation {self.flatness_sd_mm:.1f} mm)"

@@ -12,8 +12,17 @@ from advnerf_core.attack.printing.poster import poster_of
 from advnerf_core.data.image_files import write_image
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.fields.voxel_grid import face_corners_in_object
-from advnerf_core.geometry import Pinhole, invert_transform, make_transform, planar_pose, rotation_z
+from advnerf_core.geometry import (
+    Pinhole,
+    invert_transform,
+    make_transform,
+    planar_pose,
+    rotation_x,
+    rotation_z,
+)
 from calibration.print_chart import make_chart
+from calibration.print_measurement import WIDTH, of_photograph
+from calibration.print_pose import PrintPose
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
@@ -242,3 +251,18 @@ def test_no_input_is_overwritten(call, folder):
         code, said = call(*command, folder / output)
         assert (code, refusal in said) == (2, True), said
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(("roll_deg", "tilt_deg"), [(179, 0), (90, 5), (-90, 0), (30, 10), (0, 20), (4, 0)])
+def test_a_print_that_does_not_hang_upright_is_said_to_be_turned(roll_deg, tilt_deg):
+    T = before_camera(0.9, 35, tilt_deg) @ make_transform(rotation_x(np.radians(roll_deg)), np.zeros(3))
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    T_world_from_camera = planar_pose(1.0, 2.0, 0.7) @ make_transform(level, [0.1, 0.0, 0.2])
+    pose = PrintPose(T, (1, 2, 3), (), *[0.0] * 6, aspect=1.0)
+    for known, where in ((None, "of the photograph"), ((WIDTH, 1.0, 0.0), "the horizontal: ")):
+        found = of_photograph("p.png", (0.4, 0.4), 12, pose, known, T_world_from_camera)
+        said = dict(found.lines).get("turned", "")
+        # For a viewer, x of the face points at them: a positive turn about it is anticlockwise.
+        assert (f"{abs(roll_deg)} degrees" in said) == (abs(roll_deg) > 10), said
+        assert ("anticlockwise" in said) == (10 < roll_deg < 180)
+        assert not said or (where in said and "not as it was searched" in said)
