@@ -6,6 +6,7 @@ pydantic takes ``true`` for 1, ``"12"`` for 12 and ``1`` for ``true``. In a file
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 import types
 import typing
@@ -14,7 +15,15 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, Tag, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    GetCoreSchemaHandler,
+    Tag,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic_core import CoreSchema, PydanticKnownError, SchemaValidator, core_schema
 
 from advnerf_core.documents import Document, Key, raise_problems
@@ -103,6 +112,36 @@ class StrictModel(BaseModel):
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Schema of the class, in which numbers and booleans are strict."""
         return Strict().__get_pydantic_core_schema__(source, handler)
+
+
+def at_most(largest: float, unit: str, mistaken: str) -> AfterValidator:
+    """Check of a magnitude, wider than any honest value, that a number in another unit exceeds.
+
+    Args:
+        largest: The bound.
+        unit: The number's unit.
+        mistaken: Units that it was probably given in.
+    """
+
+    def check(value: float) -> float:
+        if abs(value) > largest:
+            raise ValueError(f"expected at most {largest:g} {unit}, not {mistaken}")
+        return value
+
+    return AfterValidator(check)
+
+
+def within_a_turn(angle_rad: float) -> float:
+    """The angle, or a `ValueError` if it is more than a turn, as degrees are."""
+    if abs(angle_rad) > 2.0 * math.pi:
+        raise ValueError(
+            f"expected radians, at most a turn of 6.2832, got {angle_rad:g}; as degrees that is {math.radians(angle_rad):.4f}"
+        )
+    return angle_rad
+
+
+Angle = Annotated[float, AfterValidator(within_a_turn)]
+"""An angle [rad]; degrees are refused where they are more than a turn."""
 
 
 def validate(model: type[M], document: Document, folder: Path | None = None) -> M:

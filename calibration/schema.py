@@ -7,25 +7,34 @@ are in metres, angles in radians, transforms ``T_a_from_b`` as four rows.
 from __future__ import annotations
 
 import datetime
+import math
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from advnerf_core.documents import dump_yaml, parse_yaml, read_yaml
+from advnerf_core.documents import Document, dump_yaml, parse_yaml, read_yaml
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.errors import AdvnerfError, ConfigError, MissingFileError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
-from advnerf_core.strict import StrictModel, validate
+from advnerf_core.strict import Angle, StrictModel, at_most, validate, within_a_turn
+from calibration.fence import inside, require_simple
 from hardware.motor.limits import DriveLimits, VehicleGains
 
 Row4 = tuple[float, float, float, float]
 Point3 = tuple[float, float, float]
 Point2 = tuple[float, float]
+# Bounds that only another unit exceeds: no car, lens or test track comes near them.
+_Length = Annotated[float, at_most(20.0, "m", "cm or mm")]
+_Delay = Annotated[float, at_most(5.0, "s", "ms")]
+_Speed = Annotated[float, at_most(50.0, "m/s", "km/h or mm/s")]
+_WheelAngle = Annotated[float, at_most(0.5 * math.pi, "rad", "degrees")]
+_AngularRate = Annotated[float, at_most(100.0, "rad/s", "degrees/s")]
 _RIGID_TOLERANCE = 1e-6
 _PLANAR_TOLERANCE_M = 0.005
+_LARGEST_MOUNT_M, _LARGEST_FACE_M = 20.0, 50.0
 _OPTIONAL = ("views", "residuals", "response")
 
 
@@ -104,11 +113,15 @@ class CameraCalibration(Intrinsics):
 
     kind: Literal["camera"] = "camera"
     T_car_from_camera: tuple[Row4, Row4, Row4, Row4]
-    latency_s: float = 0.0
+    latency_s: _Delay = 0.0
 
     @field_validator("T_car_from_camera")
     @classmethod
     def _rigid(cls, rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
+        if max(abs(row[3]) for row in rows) > _LARGEST_MOUNT_M:
+            raise ValueError(
+                f"expected a camera at most {_LARGEST_MOUNT_M:g} m from the rear axle; is it in cm or mm?"
+            )
         return require_rigid(rows)
 
     @property
@@ -131,13 +144,13 @@ class GainsSection(StrictModel):
 class LimitsSection(StrictModel):
     """See `hardware.motor.limits.DriveLimits`."""
 
-    speed_min_mps: float
-    speed_max_mps: float
-    steering_min_rad: float
-    steering_max_rad: float
-    acceleration_mps2: float
-    steering_rate_radps: float
-    current_max_a: float = Field(default=60.0, gt=0.0)
+    speed_min_mps: _Speed
+    speed_max_mps: _Speed
+    steering_min_rad: _WheelAngle
+    steering_max_rad: _WheelAngle
+    acceleration_mps2: Annotated[float, at_most(100.0, "m/s^2", "cm/s^2")]
+    steering_rate_radps: _AngularRate
+    current_max_a: Annotated[float, at_most(1000.0, "A", "mA")] = Field(default=60.0, gt=0.0)
 
 
 class ResponseSection(StrictModel):
@@ -152,12 +165,12 @@ class ResponseSection(StrictModel):
         speed_lag_s: Time constant of the speed [s].
     """
 
-    pipeline_delay_s: float = Field(ge=0.0)
-    steering_delay_s: float = Field(ge=0.0)
-    steering_lag_s: float = Field(ge=0.0)
-    steering_slew_radps: float | None = Field(default=None, gt=0.0)
-    speed_delay_s: float = Field(ge=0.0)
-    speed_lag_s: float = Field(ge=0.0)
+    pipeline_delay_s: _Delay = Field(ge=0.0)
+    steering_delay_s: _Delay = Field(ge=0.0)
+    steering_lag_s: _Delay = Field(ge=0.0)
+    steering_slew_radps: _AngularRate | None = Field(default=None, gt=0.0)
+    speed_delay_s: _Delay = Field(ge=0.0)
+    speed_lag_s: _Delay = Field(ge=0.0)
 
     def attack_dynamics(self) -> dict[str, float]:
         """The section ``dynamics`` of an attack request: delay from image to wheels, lag and, if known, slew."""
@@ -183,7 +196,7 @@ class VehicleCalibration(Calibration):
     """
 
     kind: Literal["vehicle"] = "vehicle"
-    wheelbase_m: float = Field(gt=0.0)
+    wheelbase_m: _Length = Field(gt=0.0)
     gains: GainsSection
     limits: LimitsSection
     response: ResponseSection | None = None
@@ -223,6 +236,8 @@ class TargetCalibration(Calibration):
     def _a_face(cls, corners: tuple[Point3, ...]) -> tuple[Point3, ...]:
         points = np.array(corners)
         normal = np.cross(points[1] - points[0], points[3] - points[0])
+        if np.ptp(points, axis=0).max() > _LARGEST_FACE_M:
+            raise ValueError(f"expected a face of at most {_LARGEST_FACE_M:g} m; is it in cm or mm?")
         area = float(np.linalg.norm(normal))
         if area < 1e-4:
             raise ValueError("expected four corners that span a face, got a line or a point")
@@ -251,15 +266,33 @@ class RoomCalibration(Calibration):
 
     kind: Literal["room"] = "room"
     path: dict[str, Any]
-    off_track_m: float = Field(gt=0.0)
+    off_track_m: _Length = Field(gt=0.0)
     fence_m: tuple[Point2, ...] = Field(min_length=3)
-    start_pose: tuple[float, float, float]
+    start_pose: tuple[float, float, Angle]
 
     @field_validator("path")
     @classmethod
     def _a_path(cls, path: dict[str, Any]) -> dict[str, Any]:
-        DrivingPath.from_dict(path)
+        within_a_turn(DrivingPath.from_dict(path).start_pose[2])
         return path
+
+    @field_validator("fence_m")
+    @classmethod
+    def _a_fence(cls, fence: tuple[Point2, ...]) -> tuple[Point2, ...]:
+        require_simple(fence)
+        return fence
+
+    @model_validator(mode="after")
+    def _inside_the_fence(self) -> RoomCalibration:
+        path = self.reference_path
+        if not inside(self.start_pose[:2], self.fence_m):
+            raise ValueError(f"expected start_pose inside fence_m, got {self.start_pose} outside")
+        points = path.pose_at(np.linspace(0.0, path.length_m, 200))[:, :2].tolist()
+        if not any(inside((x, y), self.fence_m) for x, y in points):
+            raise ValueError(
+                "expected the path inside fence_m, but all of it is outside; are both in m, in the same frame?"
+            )
+        return self
 
     @property
     def reference_path(self) -> DrivingPath:
@@ -276,6 +309,14 @@ def load_calibration(model: type[C], path: Path | str) -> C:
         return validate(model, read_yaml(Path(path)))
     except MissingFileError:
         raise CalibrationError(f"{path}: no such calibration file") from None
+    except ConfigError as error:
+        raise CalibrationError(str(error)) from None
+
+
+def measured(model: type[C], **values: Any) -> C:
+    """A calibration from measured values, of which those that are impossible are one `CalibrationError`."""
+    try:
+        return validate(model, Document(values, "what was measured"))
     except ConfigError as error:
         raise CalibrationError(str(error)) from None
 

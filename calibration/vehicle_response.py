@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 
 from advnerf_core.geometry import Array
 from calibration.degeneracy import DegenerateDataError, PoorFitError
-from calibration.schema import GainsSection, ResponseSection, VehicleCalibration
+from calibration.schema import GainsSection, ResponseSection, VehicleCalibration, measured
 from calibration.vehicle import GainsFit, RecordedDrive
 
 GRID_S, WINDOW = 0.01, 6  # the window in steps of the grid
@@ -170,7 +170,8 @@ def vehicle_calibration(
         "steering_unexplained": steering.unexplained,
         "speed_unexplained": speed.unexplained,
     }
-    return VehicleCalibration(
+    return measured(
+        VehicleCalibration,
         date=datetime.date.today(),
         views=len(gains.segments),
         wheelbase_m=gains.wheelbase_m,

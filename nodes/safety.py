@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from advnerf_core.strict import StrictModel
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from nodes.control.arming import Arming, ArmingLimits
-from nodes.control.arming_gates import ClockGate, HandGate, inside, require_simple
+from nodes.control.arming_gates import ClockGate, HandGate
 from nodes.control.arming_requests import ArmRequests
 from nodes.control.pose_check import MotionBounds, PoseCheck, PoseGate
 from nodes.control.stall_check import StallGate, StallLimits
@@ -26,7 +26,7 @@ from nodes.control.stamps import (
     stamp_problem,
 )
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.errors import ConfigError, MessageError
+from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import drive_message, header, pose_matrix, types
 from nodes.runtime.messages import stamp_ns as stamp_of
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
@@ -125,12 +125,7 @@ class SafetyConfig(StrictModel):
         return StallGate(limits)
 
     def limits(self, room: RoomCalibration) -> ArmingLimits:
-        """Make the limits of the arming. A fence that does not contain the start pose is refused."""
-        require_simple(room.fence_m)
-        if not inside(room.start_pose[:2], room.fence_m):
-            raise ConfigError(
-                f"expected start_pose inside fence_m in {self.room}, got {room.start_pose} outside; correct the room file"
-            )
+        """Make the limits of the arming."""
         return ArmingLimits(
             nodes=self.nodes,
             fence_m=room.fence_m,

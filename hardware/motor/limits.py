@@ -74,8 +74,15 @@ class VehicleGains:
             self.erpm_per_mps == 0.0
             or self.servo_per_rad == 0.0
             or not 0.0 <= self.servo_min < self.servo_max <= 1.0
+            or not self.servo_min <= self.servo_offset <= self.servo_max
         ):
-            raise ValueError(f"expected gains that are not zero and servo limits in 0..1, got {self}")
+            raise ValueError(
+                f"expected gains that are not zero, servo limits in 0..1 and servo_offset between them, got {self}"
+            )
+        if (self.servo_max - self.servo_min) / abs(self.servo_per_rad) > math.pi:
+            raise ValueError(
+                f"expected servo_per_rad so that the servo turns the wheels by less than pi, is it per degree? Got {self}"
+            )
 
     def erpm(self, speed_mps: float) -> float:
         """Electrical rpm for a speed."""

@@ -161,12 +161,14 @@ def attack_measure(
 
 
 def _pose(text: str | None) -> tuple[float, float, float] | None:
+    from advnerf_core.strict import within_a_turn
     from calibration.schema import CalibrationError
 
     if text is None:
         return None
     try:
         x_m, y_m, yaw_rad = map(float, text.split(","))
+        within_a_turn(yaw_rad)
     except ValueError:
         raise CalibrationError(
             f"expected --car X,Y,YAW in m and rad, such as 1.2,-0.4,3.1; got {text!r}"

@@ -224,7 +224,8 @@ def vehicle(
     live: LiveOptions,
     source: Source = None,
     wheelbase_m: Annotated[
-        float | None, typer.Option("--wheelbase", min=0.05, help="By ruler [m].", show_default="of --before")
+        float | None,
+        typer.Option("--wheelbase", min=0.05, max=20.0, help="By ruler [m].", show_default="of --before"),
     ] = None,
 ) -> None:
     """Calibrate speed gain, servo gain and offset, rear axle, delay and lag from circles, straight runs and steps."""

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from advnerf_core.geometry import Array
     from calibration.path_fit import PathFit
-    from calibration.schema import RoomCalibration
+    from calibration.schema import RoomCalibration, measured
 
 app = typer.Typer(
     no_args_is_help=True, help="Measure path, fence and targets with motion capture; place board and monitor."
@@ -59,7 +59,9 @@ def room_path(
     fit = fit_path(trace, closed)
     old = _old_room(output)
     fence = old.fence_m if old else fence_around(fit.path, fence_margin_m)
-    room = RoomCalibration(
+    _require_clearance(clearance(fit.path, fence))
+    room = measured(
+        RoomCalibration,
         date=date.today(),
         method=f"path fitted to {topic}",
         path=fit.path.to_dict(),
@@ -69,7 +71,6 @@ def room_path(
         residuals={"path_rms_mm": round(1e3 * fit.rms_m, 2), "path_worst_mm": round(1e3 * fit.worst_m, 2)},
         views=len(fit.trace),
     )
-    _require_clearance(clearance(fit.path, fence))
     picture = save_with_plot(room, output, lambda figure: _draw(figure, room, fit.trace, fit))
     _print_fit(fit)
     print(f"start {before_m:g} m before corner {corner}: {room.start_pose}")
@@ -91,7 +92,7 @@ def room_fence(
     """Fit the fence to a walk around the free floor with the car or a wand. Run ``advnerf scene room path`` first."""
     from calibration.plots import save_with_plot
     from calibration.room import clearance, fence_from_trace
-    from calibration.schema import CalibrationError, RoomCalibration
+    from calibration.schema import CalibrationError, RoomCalibration, measured
 
     old = _old_room(output)
     if old is None:
@@ -102,7 +103,8 @@ def room_fence(
     fence = fence_from_trace(trace, margin_m)
     least_m = clearance(old.reference_path, fence)
     _require_clearance(least_m)
-    room = RoomCalibration(
+    room = measured(
+        RoomCalibration,
         date=date.today(),
         method=f"{old.method}; fence walked with {topic}",
         path=old.path,

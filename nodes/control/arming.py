@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from nodes.control.arming_gates import ClockGate, HandGate, edge_distance_m, inside
+from calibration.fence import edge_distance_m, inside
+from nodes.control.arming_gates import ClockGate, HandGate
 from nodes.control.stamps import captured_mono_ns, stamp_age_s, stamp_problem
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.requests import ESTOP_LATCHED

@@ -16,6 +16,7 @@ from calibration.schema import (
     TargetCalibration,
     VehicleCalibration,
     load_calibration,
+    measured,
     save_calibration,
 )
 from hardware.motor.limits import VehicleGains
@@ -103,6 +104,24 @@ def edited(tmp_path, name, **changes):
         ),
         ("room", {"fence_m": [[0, 0], [1, 1]]}, "fence_m"),
         ("room", {"path": {"segments": []}}, "path"),
+        ("room", {"start_pose": [-1.1, -2.0, 90]}, "as degrees that is 1.5708"),
+        ("room", {"start_pose": [-1100.0, -2000.0, 0.0]}, "expected start_pose inside fence_m"),
+        ("room", {"off_track_m": 40.0}, "cm or mm"),
+        ("room", {"fence_m": [[-4, -4], [4, 4], [4, -4], [-4, 4]]}, "edges do not cross"),
+        ("room", {"fence_m": [[-4, -2], [0, -2], [4, -2]]}, "on a line"),
+        ("room", {"fence_m": [[-4000, -4000], [4000, -4000], [4000, 4000], [-4000, 4000]]}, "is it in mm"),
+        (
+            "room",
+            {"fence_m": [[10, 10], [11, 10], [11, 11]], "start_pose": [10.8, 10.2, 0.0]},
+            "path inside fence_m",
+        ),
+        (
+            "board",
+            {"corners_in_subject_m": [[0, -500, 500], [0, 500, 500], [0, 500, -500], [0, -500, -500]]},
+            "cm or mm",
+        ),
+        ("camera", {"latency_s": 30.0}, "5 s, not ms"),
+        ("vehicle", {"wheelbase_m": 25.0}, "20 m, not cm or mm"),
     ],
 )
 def test_wrong_files_are_one_clear_error(tmp_path, name, changes, words):
@@ -113,10 +132,43 @@ def test_wrong_files_are_one_clear_error(tmp_path, name, changes, words):
     assert "\n" not in str(error.value)
 
 
-def test_impossible_limits_are_found_when_the_file_is_read(tmp_path):
-    limits = yaml.safe_load((SHIPPED / "vehicle.yaml").read_text())["limits"] | {"speed_max_mps": -1.0}
-    with pytest.raises(CalibrationError, match="around zero"):
-        load_calibration(VehicleCalibration, edited(tmp_path, "vehicle", limits=limits))
+@pytest.mark.parametrize(
+    ("section", "values", "words"),
+    [
+        ("limits", {"speed_max_mps": -1.0}, "around zero"),
+        ("limits", {"speed_max_mps": 100.0}, "km/h"),
+        (
+            "limits",
+            {"steering_max_rad": 18.0},
+            "limits.steering_max_rad: expected at most 1.5708 rad, not degrees",
+        ),
+        ("limits", {"steering_min_rad": -15.0}, "degrees"),
+        ("limits", {"steering_rate_radps": 183.0}, "degrees/s"),
+        ("limits", {"current_max_a": 60000.0}, "mA"),
+        ("gains", {"servo_offset": 5.0}, "servo_offset between them"),
+        ("gains", {"servo_offset": 0.9}, "servo_offset between them"),
+        ("gains", {"servo_per_rad": -0.0212}, "per degree"),
+    ],
+)
+def test_impossible_sections_are_found_when_the_file_is_read(tmp_path, section, values, words):
+    changed = yaml.safe_load((SHIPPED / "vehicle.yaml").read_text())[section] | values
+    with pytest.raises(CalibrationError, match=words):
+        load_calibration(VehicleCalibration, edited(tmp_path, "vehicle", **{section: changed}))
+
+
+def test_the_bounds_hold_a_lorry_and_a_motorway(tmp_path):
+    vehicle = yaml.safe_load((SHIPPED / "vehicle.yaml").read_text())
+    limits = vehicle["limits"] | {"speed_max_mps": 36.0, "steering_max_rad": 1.2, "current_max_a": 400.0}
+    load_calibration(VehicleCalibration, edited(tmp_path, "vehicle", wheelbase_m=6.5, limits=limits))
+    load_calibration(CameraCalibration, edited(tmp_path, "camera", latency_s=0.4))
+
+
+def test_what_was_measured_impossibly_is_one_clear_error(tmp_path):
+    vehicle = load_calibration(VehicleCalibration, SHIPPED / "vehicle.yaml")
+    values = {name: getattr(vehicle, name) for name in VehicleCalibration.model_fields}
+    assert measured(VehicleCalibration, **values) == vehicle
+    with pytest.raises(CalibrationError, match="what was measured: wheelbase_m: expected at most 20 m"):
+        measured(VehicleCalibration, **values | {"wheelbase_m": 325.0})
 
 
 def test_missing_and_unreadable_files(tmp_path):

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calibration.fence import inside
 from nodes.control.arming import Arming, ArmingLimits
-from nodes.control.arming_gates import inside
 from nodes.runtime.wire import MessageInfo
 
 pytestmark = pytest.mark.live

@@ -6,10 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from calibration.fence import edge_distance_m, inside, require_simple
 from nodes.control.arming import Arming, ArmingLimits
-from nodes.control.arming_gates import ClockGate, HandGate, edge_distance_m, inside, require_simple
+from nodes.control.arming_gates import ClockGate, HandGate
 from nodes.runtime.clock import Now
-from nodes.runtime.errors import ConfigError
 from nodes.runtime.wire import MessageInfo
 
 pytestmark = pytest.mark.live
@@ -218,9 +218,12 @@ def test_edge_distance_against_dense_samples():
 def test_fences_whose_edges_cross_are_refused():
     require_simple(L_SHAPE)
     require_simple(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
-    with pytest.raises(ConfigError, match=r"edges do not cross, but edge 1 .* crosses edge 3"):
+    with pytest.raises(ValueError, match=r"edges do not cross, but edge 1 .* crosses edge 3"):
         require_simple(((0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 1.0)))
     assert not inside((1.0, 1.0), L_SHAPE)
+    for corners in (((0.0, 0.0), (1.0, 1.0), (2.0, 2.0)), ((0.0, 0.0), (0.0, 5.0), (0.0, 1.0), (0.0, 3.0))):
+        with pytest.raises(ValueError, match="on a line"):
+            require_simple(corners)
 
 
 def clock(offset_s, error_s=0.002, peers=()):

@@ -239,6 +239,16 @@ def test_a_drive_gives_size_pose_flatness_and_the_effect_where_it_hangs(call, se
     assert min(effect[key] for key in ("clean_m", "nominal_m", "print_m")) >= 0.0
 
 
+def test_a_yaw_in_degrees_is_refused(call, folder):
+    (folder / "photo.png").touch()
+    call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 20)
+    code, said = call(
+        "attack", "measure", folder / "photo.png", "--print", folder / "p.print.json", "--camera", folder / "lens.yaml",
+        "--car", "1,2,90",
+    )  # fmt: skip
+    assert (code, "in m and rad" in said) == (2, True), said
+
+
 def test_no_input_is_overwritten(call, folder):
     call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 50)
     (folder / "photo.png").touch()

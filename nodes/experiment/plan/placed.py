@@ -11,10 +11,10 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from advnerf_core.geometry import Array, make_transform, rotation_x, rotation_y, rotation_z
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import Angle, StrictModel
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import WorldDescription
-from nodes.experiment.plan.numbers import Angle, PositiveNumber, Unit
+from nodes.experiment.plan.numbers import PositiveNumber, Unit
 from nodes.experiment.plan.object_kinds import (
     BALL,
     CUBE,

@@ -8,9 +8,9 @@ from pydantic import Field, model_validator
 
 from advnerf_core.attack.objectives import CTE
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import Angle, StrictModel
 from nodes.experiment.plan.method_names import ArchitectureReference, ObjectiveReference
-from nodes.experiment.plan.numbers import Angle, Count, Delay, NotNegative, Positive, PositiveNumber, Unit
+from nodes.experiment.plan.numbers import Count, Delay, NotNegative, Positive, PositiveNumber, Unit
 from nodes.experiment.plan.robustness_config import RobustnessConfig
 
 # Fields of the section policy that define the network; its description replaces them in keys.
