@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 
 OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 ERROR_EXIT, FAILURE_EXIT = 2, 1
-_POLICY = "nodes.policy"
 
 PANELS = {
     "Audit and experiments": ("audit", "demo", "experiment", "verify"),
@@ -137,7 +136,7 @@ def launch(
 ) -> None:
     """Start the nodes of a launch file and supervise them. Ctrl-C stops them; a second Ctrl-C kills them.
 
-    Nothing is started if a node refuses its configuration or a policy file is missing.
+    Nothing is started if a node refuses its configuration, or a calibration, attack or policy file is missing.
     """
     from advnerf_core.places import require_utf8
     from nodes.lab.plugin_tables import say_code
@@ -187,23 +186,20 @@ def _print_plan(plan: Any) -> None:
 
 
 def _cheap_problems(plan: Any) -> list[str]:
-    """Errors that show in a second: of the nodes' configurations, and policy files that are not there."""
+    """Errors that show in a second: of the nodes' configurations, calibrations and attacks, and policy files that are not there."""
+    from nodes.lab.doctor import files
+    from nodes.lab.doctor.launch import missing_policies
     from nodes.launching.launch_check import check_nodes
 
-    if problems := list(check_nodes(plan).values()):
-        return problems
-    if not any(entry.module == _POLICY for entry in plan.nodes.values()):
-        return []
-    from nodes.lab.doctor.launch import missing_policies
-
-    return missing_policies(plan)
+    return list(check_nodes(plan).values()) or missing_policies(plan) or files.problems(plan)[0]
 
 
 def _problems(plan: Any) -> list[str]:
     """All errors. The policies are loaded, in seconds, only if nothing else is wrong."""
+    from nodes.lab.doctor import files
     from nodes.lab.doctor.launch import policy_problems
 
-    return _cheap_problems(plan) or policy_problems(plan)
+    return _cheap_problems(plan) or files.problems(plan)[1] or policy_problems(plan)
 
 
 def _refuse(problems: Sequence[str]) -> None:

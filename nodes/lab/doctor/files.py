@@ -22,6 +22,7 @@ from nodes.lab.doctor.check import FAILURE, OK, CheckResult, report
 from nodes.launching.launch_file import Plan
 
 _CURE = "run advnerf car calibrate (docs/calibration.md), or set params.calibration to the right folder"
+_PATH_CURE = "correct the path, which is relative to the current folder"
 _COMMON: dict[str, type[Calibration]] = {
     "camera": CameraCalibration, "target": TargetCalibration, "room": RoomCalibration, "vehicle": VehicleCalibration,
 }  # fmt: skip
@@ -65,7 +66,7 @@ def named(plan: Plan) -> list[CheckResult]:
                 "files",
                 FAILURE,
                 f"{name}: no file {value}",
-                "correct the path, which is relative to the current folder",
+                _PATH_CURE,
             )
             for value in _paths(data)
             if value not in known and not Path(value).exists()
@@ -75,10 +76,20 @@ def named(plan: Plan) -> list[CheckResult]:
     return rows or report("files", OK, "all files that the nodes name exist")
 
 
+def problems(plan: Plan) -> tuple[list[str], list[str]]:
+    """Return the errors of calibrations and attacks, without which no node starts, and those of all other files, as one line each."""
+    found: tuple[list[str], list[str]] = [], []
+    for row in (*calibrations(plan), *named(plan)):
+        if row.state == FAILURE:
+            found[row.check == "files"].append(" ".join(f"{row.found}; {row.do}".split()))
+    return found
+
+
 def _paths(value: Any) -> Iterator[str]:
     if isinstance(value, dict):
-        for item in value.values():
-            yield from _paths(item)
+        for key, item in value.items():
+            if key != "attack" or not isinstance(item, str):  # see _attack
+                yield from _paths(item)
     elif isinstance(value, list):
         for item in value:
             yield from _paths(item)
@@ -89,7 +100,7 @@ def _paths(value: Any) -> Iterator[str]:
 def _attack(name: str, data: dict[str, Any]) -> list[CheckResult]:
     file = Path(data["attack"])
     if not file.exists():
-        return []  # reported already
+        return report("attack", FAILURE, f"{name}: no file {file}", _PATH_CURE)
     try:
         attack = load_attack(file)
     except AdvnerfError as error:

@@ -1,6 +1,8 @@
 """``advnerf doctor LAUNCH``: what a launch file needs here, with the emulators in the place of the car's devices."""
 
 import json
+import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -276,6 +278,52 @@ def test_launch_check_says_which_policy_does_not_fit_the_camera(tmp_path, monkey
     with pytest.raises(typer.Exit):
         cli._refuse(cli._problems(missing))
     assert "trained for 400 x 224" in capsys.readouterr().err
+
+
+def _no_folder(folder):
+    return [
+        "params.calibration=nosuch"
+    ], r"nosuch/camera.yaml: no such calibration file; run advnerf car calibrate"
+
+
+def _typo(folder):
+    file = folder / "vehicle.yaml"
+    file.write_text(file.read_text().replace("wheelbase_m", "whelbase_m"))
+    return [f"params.calibration={folder}"], r"vehicle.yaml:\d+: unknown key whelbase_m"
+
+
+def _swapped(folder):
+    (folder / "camera.yaml").write_text((folder / "room.yaml").read_text())
+    return [f"params.calibration={folder}"], r"camera.yaml:1: kind"
+
+
+def _no_attack(folder):
+    return ["params.attack=nosuch.safetensors"], "compositor: no file nosuch.safetensors; correct the path"
+
+
+def _no_attack_of_any_kind(folder):
+    return ["params.attack=nosuch"], "compositor: no file nosuch;"
+
+
+def _broken_attack(folder):
+    (folder / "a.safetensors").write_bytes(b"no attack")
+    return [f"params.attack={folder / 'a.safetensors'}"], "a.safetensors"
+
+
+@pytest.mark.parametrize(
+    "spoil", [_no_folder, _typo, _swapped, _no_attack, _no_attack_of_any_kind, _broken_attack]
+)
+def test_launch_refuses_what_the_doctor_finds_of_files(tmp_path, monkeypatch, spoil):
+    monkeypatch.setattr("nodes.launching.launch_check.check_nodes", lambda plan: {})
+    policy = saved_policy(tmp_path / "policy.safetensors", 336, 188)
+    folder = tmp_path / "twin"
+    shutil.copytree(TWIN, folder)
+    assert cli._cheap_problems(plan_of("green_screen", f"params.policy={policy}")) == []
+    overrides, said = spoil(folder)
+    plan = plan_of("green_screen", f"params.policy={policy}", *overrides)
+    problems = cli._cheap_problems(plan)
+    assert re.search(said, "\n".join(problems)), problems
+    assert all("\n" not in each for each in problems)
 
 
 @pytest.mark.slow  # a policy in a process of its own, and every node
