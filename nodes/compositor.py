@@ -242,7 +242,10 @@ class CompositorNode(Node):
 def show(
     attack: AttackFile, camera: CameraCalibration, target: TargetCalibration, supersample: int = 2
 ) -> Showing:
-    """Prepare an attack for a camera and a face. An attack without a face, or of another size or subject, is refused."""
+    """Prepare an attack for a camera and a face. An attack without a face, or for a face of another size or subject, is refused.
+
+    The camera may have another size than the attack's, which is that of the images its policy saw.
+    """
     face = attack.required_face()
     corners = target.corners
     size_m = (np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(corners[3] - corners[0]))
