@@ -15,6 +15,11 @@ from calibration.print_pose import PrintPose
 CARD, DISTANCE, WIDTH, POSES = "a card", "the distance", "the width", "the camera's poses"
 # Beyond what a hand that holds the camera tilts it; and a print that faces up or down has no upright.
 _UPRIGHT_DEG, _LEAST_UPRIGHT = 10.0, 0.5
+# No printer is off by more, but a length in another unit is; and no shade covers so much of a print that was found.
+_LARGEST_OFF, _OTHER_SHARE = 0.3, 0.5
+_NO_PLACE = (
+    "unknown: give the camera file of the car, --car X,Y,YAW, and the size with --card, --distance or --width"
+)
 _NO_SIZE = "unknown: one photograph gives the pose in units of the nominal size; give --card, --distance or --width, or a bag with the car's poses"
 
 
@@ -102,6 +107,8 @@ class PrintMeasurement(PlainData):
                     f"x {T[0, 3]:.3f}, y {T[1, 3]:.3f}, z {T[2, 3]:.3f} m, faces {yaw_deg:.1f} degrees, {up_deg:+.1f} up",
                 )
             )
+        else:
+            rows.append(("in the world", _NO_PLACE))
         if (turned := self._turned()) is not None:
             rows.append(("turned", turned))
         rows.append(("direction within", f"{self.angle_sd_deg:.2f} degrees (standard deviation)"))
@@ -120,9 +127,14 @@ class PrintMeasurement(PlainData):
         if self.size_m is None:
             return _NO_SIZE
         (width, height), (w, h) = self.size_m, self.nominal_m
+        doubt = (
+            ""
+            if abs(np.log(self.scale)) < np.log1p(_LARGEST_OFF)
+            else "; no printer is so far off: is that length right, and in m?"
+        )
         return (
             f"{width:.4f} x {height:.4f} m ({100 * (width / w - 1):+.2f} % and {100 * (height / h - 1):+.2f} % of nominal), by {self.size_from}, "
-            f"within {100 * self.size_sd:.2f} %"
+            f"within {100 * self.size_sd:.2f} %{doubt}"
         )
 
     def _turned(self) -> str | None:
@@ -144,7 +156,13 @@ class PrintMeasurement(PlainData):
         found = self.colours
         red, green, blue = found.mean
         text = f"{found.rms:.0f} of 255 from nominal (mean {red:+.0f}, {green:+.0f}, {blue:+.0f}), light uneven by {100 * found.uneven:.0f} %"
-        text += f"; {100 * found.far_share:.0f} % far off: covered?" if found.far_share > 0.02 else ""
+        if found.far_share > 0.02:
+            why = (
+                "covered?"
+                if found.far_share < _OTHER_SHARE
+                else "another texture in this frame, or the wrong --print or --attack?"
+            )
+            text += f"; {100 * found.far_share:.0f} % far off: {why}"
         hidden = 1.0 - found.seen_share
         return text + (
             f"; {100 * hidden:.0f} % outside the picture, taken from the nominal texture"

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -21,6 +22,8 @@ from advnerf_core.geometry import (
     rotation_z,
 )
 from calibration.print_chart import make_chart
+from calibration.print_colour import ColourError
+from calibration.print_markers import why_none
 from calibration.print_measurement import WIDTH, of_photograph
 from calibration.print_pose import PrintPose
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
@@ -276,3 +279,24 @@ def test_a_print_that_does_not_hang_upright_is_said_to_be_turned(roll_deg, tilt_
         assert (f"{abs(roll_deg)} degrees" in said) == (abs(roll_deg) > 10), said
         assert ("anticlockwise" in said) == (10 < roll_deg < 180)
         assert not said or (where in said and "not as it was searched" in said)
+
+
+def test_what_cannot_be_right_or_is_not_known_is_said():
+    pose = PrintPose(before_camera(0.9), (1, 2, 3), (), *[0.0] * 6, aspect=1.0)
+    for scale, doubtful in ((0.8, False), (1.2, False), (9.99, True), (3.28, True), (0.1, True)):
+        found = of_photograph("p.png", (0.4, 0.4), 12, pose, (WIDTH, scale, 0.0), None)
+        assert ("in m?" in dict(found.lines)["size"]) == doubtful
+        assert "--car X,Y,YAW" in dict(found.lines)["in the world"]
+    for share, words in ((0.2, "covered?"), (0.99, "wrong --print")):
+        colours = ColourError(rms=30.0, mean=(0.0, 0.0, 0.0), uneven=0.0, far_share=share, seen_share=1.0)
+        assert words in dict(replace(found, colours=colours).lines)["colours"]
+
+
+def test_a_camera_that_moved_is_named(folder):
+    sharp = photograph([(poster(folder), before_camera(0.9, 10))], LENS)
+    assert "not in view" in why_none(sharp)
+    across = np.zeros((25, 25), np.float32)
+    across[12] = 1.0
+    for way_deg in (0, 33, 90):
+        kernel = cv2.warpAffine(across, cv2.getRotationMatrix2D((12, 12), way_deg, 1.0), (25, 25))
+        assert "the camera moved" in why_none(cv2.filter2D(sharp, -1, kernel / kernel.sum()))
