@@ -10,7 +10,7 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from nodes.runtime.paths import private_folder, user_folder, user_folders
+from nodes.runtime.paths import bus_folder, private_folder, user_folder, user_folders
 
 
 def active_launches() -> list[dict[str, Any]]:
@@ -28,7 +28,17 @@ def active_launches() -> list[dict[str, Any]]:
 
 def is_running(run_dir: Path) -> bool:
     """Whether a launch is running in a run folder."""
-    with open(run_dir / "launch.lock", encoding="ascii") as lock:
+    return _is_held(run_dir / "launch.lock")
+
+
+def has_ended(run_dir: Path) -> bool:
+    """Whether neither a launch nor any node of this host is left in a run folder, by the locks that end with their processes."""
+    locks = [run_dir / "launch.lock", *bus_folder(run_dir).glob("*.lock")]
+    return not any(_is_held(lock) for lock in locks if lock.exists())
+
+
+def _is_held(file: Path) -> bool:
+    with open(file, encoding="ascii") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except OSError:

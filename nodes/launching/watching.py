@@ -56,8 +56,12 @@ def find_run_dir(given: Path | None) -> Path:
             raise LaunchError(f"expected a run folder at {given}, found none; correct --folder")
         return given
     launches = active_launches()
-    if len(launches) != 1:
-        found = ", ".join(str(launch["run_dir"]) for launch in launches) or "none"
+    if not launches:
+        raise LaunchError(
+            "expected a running launch, found none; start one with advnerf launch FILE, or give the folder of a run with --folder"
+        )
+    if len(launches) > 1:
+        found = ", ".join(str(launch["run_dir"]) for launch in launches)
         raise LaunchError(
             f"expected one running launch, found {len(launches)} ({found}); select one with --folder"
         )

@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nodes.launching.running import has_ended
 from nodes.runtime.arm_requests import arm_message, ask_to_arm
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import drive_message, header, pose_message, types
+from nodes.runtime.paths import RESOLVED_NAME
 from nodes.runtime.requests import RequestIdentity
 from tests.support.disarm import ask_to_disarm
 from tests.support.waiting import wait_for
@@ -275,3 +277,16 @@ def sender(lab):
     with Bus(lab.folder) as bus:
         bus.subscribe("/safety/state")
         yield Sender(bus)
+
+
+def test_nothing_can_be_armed_where_every_process_has_ended(lab):
+    lab.start()
+    lab.wait_ready()
+    assert not has_ended(lab.folder)
+    lab.close()
+    assert has_ended(lab.folder)
+    _, errors = command(lab, "car", "arm").communicate(timeout=600)
+    assert "all of its nodes have ended, so nothing can be armed" in errors
+    (lab.folder / RESOLVED_NAME).write_text("nodes: {gateway: {module: nodes.gateway}}\n")
+    _, errors = command(lab, "car", "arm").communicate(timeout=600)
+    assert "the car may be armed" in errors  # by a safety node on another host

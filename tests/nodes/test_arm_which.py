@@ -169,3 +169,8 @@ def test_in_a_terminal_the_person_decides(desk, names, typed, armed):
             lab.wait_state(lambda state: state.answered_id and state.granted, "a request that was granted")
         else:
             assert lab.recorded == []
+
+
+def test_without_a_launch_the_way_to_start_one_is_told(desk):
+    _, errors = desk.advnerf("car", "arm").communicate(timeout=600)
+    assert "expected a running launch, found none; start one with advnerf launch FILE" in errors
