@@ -51,6 +51,16 @@ class SplitLimits:
         return late or part.size_bytes >= self.size_mib * _BYTES_PER_MIB
 
 
+def require_new(folder: Path) -> None:
+    """Refuse a folder for a new bag that holds anything.
+
+    Raises:
+        BagError: It exists, and is not empty.
+    """
+    if folder.is_file() or (folder.exists() and any(folder.iterdir())):
+        raise BagError(f"{folder} exists and is not empty; record to another folder, or remove it")
+
+
 class BagWriter:
     """Writes one bag. Not thread-safe.
 
@@ -78,8 +88,7 @@ class BagWriter:
         self._limits, self._metadata, self._compressed = limits, dict(metadata or {}), compressed
         self._files: dict[str, Contents] = {}
         self._open = False
-        if self.folder.exists() and any(self.folder.iterdir()):
-            raise BagError(f"{self.folder} exists and is not empty; record to another folder, or remove it")
+        require_new(self.folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._hold_reserve()

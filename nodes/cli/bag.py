@@ -147,11 +147,13 @@ def bag_record(
     run_dir: RunDir = None,
 ) -> None:
     """Record the topics of a running launch until Ctrl-C."""
+    from nodes.bags.writer import require_new
     from nodes.launching.watching import find_run_dir, node_names
     from nodes.recorder import RecorderConfig, RecorderNode
     from nodes.runtime.process import run_node
 
     folder = output if output.name else Path(f"bag-{time.strftime('%Y%m%d-%H%M%S')}")
+    require_new(folder)
     run = find_run_dir(run_dir)
     statuses = [] if topics else node_names(run)
     config = RecorderConfig(output=folder.resolve(), topics=topics, statuses_of=statuses)

@@ -101,6 +101,7 @@ class Launch:
         """Lock the run folder, write the resolved configuration and start all nodes."""
         self._lock = _lock_run(self.run_dir)
         try:
+            self._require_new_bags()
             self._write_configuration()
         except BaseException:
             self._lock.close()
@@ -181,6 +182,14 @@ class Launch:
             child.given_up = False
             child.start()
             self._report(f"{child.name}: started again, process {child.pid}")
+
+    def _require_new_bags(self) -> None:
+        """Refuse a run folder with a bag of an earlier launch, before any node starts; the recorder would."""
+        from nodes.bags.writer import require_new
+
+        for name, entry in self.plan.nodes.items():
+            if entry.module == "nodes.recorder":
+                require_new(self.run_dir / self.plan.documents[name].data.get("output", "bag"))
 
     def _write_configuration(self) -> None:
         resolved = dump_yaml(self.plan.resolved)

@@ -262,6 +262,7 @@ def test_launch_check_asks_the_nodes_about_their_configuration(folder):
             ["car", "topic", "echo", "/nothing", "--folder", "{folder}"],
             "unknown topic '/nothing'; known are /camera/image_raw",
         ),
+        (["bag", "record", "-o", "{folder}"], "{folder} exists and is not empty; record to another folder"),
         (["car", "topic", "list", "--folder", "{folder}/none"], "expected a run folder at"),
         (["launch", "{folder}/little.launch.yaml", "--set", "x"], "no node called 'x'; known are sender"),
         (
@@ -272,8 +273,8 @@ def test_launch_check_asks_the_nodes_about_their_configuration(folder):
 )
 def test_mistake_is_one_line_without_a_traceback(folder, command, arguments, message, monkeypatch):
     monkeypatch.syspath_prepend(folder)
-    code, _, errors = command(*(argument.format(folder=folder) for argument in arguments))
-    assert code == 2
+    code, output, errors = command(*(argument.format(folder=folder) for argument in arguments))
+    assert (code, output) == (2, "")
     assert errors.startswith("error: ")
     assert errors.count("\n") == 1
     assert message.format(folder=folder) in errors

@@ -15,7 +15,7 @@ from nodes.launching.launch import Launch
 from nodes.launching.launch_file import load_launch
 from nodes.launching.running import active_launches
 from nodes.recorder import RecorderConfig
-from nodes.runtime.errors import ConfigError, LaunchError
+from nodes.runtime.errors import BagError, ConfigError, LaunchError
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
@@ -301,6 +301,21 @@ def test_record_adds_a_recorder_that_stops_last(probe, tmp_path):
     )
     assert plan.nodes["recorder"].stop_last
     assert plan.documents["recorder"].data["statuses_of"] == ["a"]
+
+
+def test_a_bag_of_an_earlier_launch_is_refused_before_anything_starts(probe, tmp_path):
+    file = write(tmp_path / "r.launch.yaml", a={})
+    file.write_text(file.read_text() + "record: {output: my_bag}\n")
+    bag, lines = tmp_path / "run" / "my_bag", []
+    bag.mkdir(parents=True)
+    (bag / "my_bag_0.mcap").touch()
+    launch = Launch(file, run_dir=tmp_path / "run", report=lines.append)
+    with pytest.raises(BagError, match="my_bag exists and is not empty; record to another folder"):
+        launch.start()
+    assert (launch.pids, lines) == ({}, [])
+    assert list((tmp_path / "run").rglob("*.yaml")) == []
+    with Launch(file, ["record=false"], tmp_path / "run") as other:  # the folder is free again
+        other.wait_ready()
 
 
 @pytest.mark.parametrize(
