@@ -87,6 +87,12 @@ class PosedImages:
     ignored: tuple[str, ...] = ()
 
     @property
+    def files(self) -> list[Path]:
+        """Every file that the data set reads."""
+        masks = [frame.mask for frame in self.frames if frame.mask is not None]
+        return [*([] if self.file is None else [self.file]), *(frame.path for frame in self.frames), *masks]
+
+    @property
     def remarks(self) -> list[str]:
         """Unused parts of the file, in lines for its user."""
         lines = [f"skipped, file not found: {path}" for path in self.missing]

@@ -91,6 +91,8 @@ def object_build(
     With --images, the training split of the data set is used. Without a split, 7 of 8 images are used if there are 16 or
     more. The command prints the PSNR on training and held-out images, and advice if it is low.
     """
+    from advnerf_core.data.transforms import load_transforms
+    from advnerf_core.files import refuse_overwriting
     from advnerf_core.objects.voxel.build import build_from_mesh
     from advnerf_core.objects.voxel.model import save_object
     from advnerf_core.places import require_utf8
@@ -108,10 +110,14 @@ def object_build(
     name = generate or _name(file or images or Path())
     path = output or Path(f"{name}.object.safetensors")
     require_utf8(path)
+    listed = None if images is None else load_transforms(images)
+    refuse_overwriting([file, *(listed.files if listed else ())], [path])
     with ProgressDisplay() as display:
         report = display.start("object")
-        if images is not None:
-            model = _from_images(images, name, resolution, steps, minutes, size, coarse_to_fine, report)
+        if listed is not None:
+            model = _from_images(
+                str(images), listed, name, resolution, steps, minutes, size, coarse_to_fine, report
+            )
         else:
             mesh, source = _mesh(file, generate, up, height_m, unit)
             model = build_from_mesh(mesh, name, resolution, 400 if steps is None else steps, source, report)
@@ -130,10 +136,13 @@ def object_show(
     import numpy as np
 
     from advnerf_core.data.image_files import write_image
+    from advnerf_core.files import refuse_overwriting
     from advnerf_core.objects.voxel.build import draw_object
     from advnerf_core.objects.voxel.model import load_object
     from advnerf_core.objects.voxel.views import ring, viewing_lens
 
+    path = output or file.with_suffix(".png")
+    refuse_overwriting([file], [path])
     model = load_object(file)
     poses = ring(model.solid_box, _TURNTABLE_VIEWS)
     drawn = draw_object(model, poses, viewing_lens(_TURNTABLE_PIXELS))
@@ -141,7 +150,6 @@ def object_show(
     half = _TURNTABLE_VIEWS // 2
     sheet = np.concatenate([np.concatenate(list(row), axis=1) for row in (pictures[:half], pictures[half:])])
     pixels = np.rint(255 * np.clip(sheet, 0.0, 1.0)).astype(np.uint8)
-    path = output or file.with_suffix(".png")
     write_image(path, pixels)
     print(path)
 
@@ -187,7 +195,8 @@ def _name(source: Path) -> str:
 
 
 def _from_images(
-    transforms: Path,
+    source: str,
+    listed: PosedImages,
     name: str,
     resolution: int,
     steps: int | None,
@@ -196,11 +205,9 @@ def _from_images(
     coarse_to_fine: bool,
     report: Report,
 ) -> ObjectModel:
-    from advnerf_core.data.transforms import load_transforms
     from advnerf_core.objects.voxel.build import build_from_images
     from advnerf_core.objects.voxel.pictures import load_pictures
 
-    listed = load_transforms(transforms)
     for remark in listed.remarks:
         print(remark)
     training, held_out = _split(listed)
@@ -214,7 +221,7 @@ def _from_images(
         name,
         resolution,
         (_DEFAULT_STEPS if minutes is None else _NO_STEP_LIMIT) if steps is None else steps,
-        {"images": str(transforms)},
+        {"images": source},
         report,
         None if held_out is None else load_pictures(_spread(held_out), size),
         None if minutes is None else 60.0 * minutes,

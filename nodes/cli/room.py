@@ -147,6 +147,7 @@ def room_target(
     """
     import numpy as np
 
+    from advnerf_core.files import refuse_overwriting
     from calibration.panel import target_size
     from calibration.room import target_of_size, target_of_touches
     from calibration.schema import CalibrationError, save_calibration
@@ -155,6 +156,7 @@ def room_target(
         raise CalibrationError(
             "expected either a bag in which a wand touches the corners or --face-size WxH; give one of them"
         )
+    refuse_overwriting([bag], [output])
     if size is not None:
         width, height = _numbers(size.replace("x", ","), 2, "--face-size")
         target = target_of_size(

@@ -106,12 +106,14 @@ def scene_render(
 ) -> None:
     """Render a scene from the cameras of a data set: colour, depth and, optionally, a video."""
     from advnerf_core.data.transforms import load_transforms
+    from advnerf_core.files import refuse_overwriting
     from advnerf_core.splats.scene_file import load_renderer
     from nodes.lab.scene_training import render
     from nodes.runtime.progress import ProgressDisplay
 
     renderer = load_renderer(scene, interval_scale)
     listed = load_transforms(transforms)
+    refuse_overwriting([scene, *listed.files], [video])
     listed = listed.training_and_held_out(every)[1] if held_out else listed.sorted_by_name()
     with ProgressDisplay() as display:
         count = render(renderer, listed, size, output, video, display.start("render"))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.video import thinned
 from advnerf_core.data.views import ImageSet
+from advnerf_core.files import refuse_overwriting
 from advnerf_core.scene.colour import IDENTITY, ColourMap, fit_colour_map
 from advnerf_core.scene.field import load_scene, save_scene
 from advnerf_core.scene.metrics import psnr
@@ -48,8 +49,10 @@ def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourM
 
     Raises:
         ImportRecordingError: The frames do not show the scene.
+        PlaceError: The output is a file of the images.
     """
     listed = load_transforms(images)
+    refuse_overwriting(listed.files, [output])
     frames = listed.with_frames(thinned(list(listed.frames), most)).load()
     field, occupied, metadata = load_scene(scene)
     # Do not apply the map of an earlier fit.

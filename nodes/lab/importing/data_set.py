@@ -74,7 +74,7 @@ def from_media(
         facts = {"structure_from_motion": model.summary(), **placing}
         return write_model_set(folder, model, poses, points, facts)
 
-    return build_beside(output, media, build)
+    return build_beside(output, [*media, metric.positions], build)
 
 
 def from_bag(
@@ -100,7 +100,7 @@ def from_bag(
         _write_car(folder / TRANSFORMS, frames, {**_box(reach, margin=0.0), "world": "mocap"})
         return _reported(folder, facts)
 
-    return build_beside(output, (), build, resumes=False)
+    return build_beside(output, [bag, calibration], build, resumes=False)
 
 
 def from_phone_and_car(
@@ -154,7 +154,7 @@ def from_phone_and_car(
         }
         return _write_joint(folder, model, placed, frames, facts)
 
-    return build_beside(output, media, build)
+    return build_beside(output, [*media, bag, calibration], build)
 
 
 def _reconstruct(output: Path, sources: Sequence[PhotoSource], sfm: SfmConfig, report: Report) -> Model:

@@ -10,8 +10,9 @@ import numpy as np
 
 from advnerf_core.data.similarity import Similarity
 from advnerf_core.data.transforms import load_transforms
-from advnerf_core.data.views import ImageSet
+from advnerf_core.data.views import ImageSet, PosedImages
 from advnerf_core.documents import read_json
+from advnerf_core.files import refuse_overwriting
 from advnerf_core.geometry import Array, make_transform
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.splats.cleaning import Removed, central_box, clean
@@ -61,12 +62,15 @@ def from_splat(file: Path, output: Path, options: SplatOptions) -> ImportedSplat
     Raises:
         SplatError: The file cannot be read or used.
         ImportRecordingError: The scale is unknown, or the splat does not show the images.
+        PlaceError: The output is the splat, or a file of the images.
     """
     require_scale(file, options)
+    listed = None if options.images is None else load_transforms(options.images)
+    refuse_overwriting([file, *(listed.files if listed else ())], [output])
     splats, removed = clean(read_splats(file), not options.keep_floaters)
     psnr_db = None
-    if options.images is not None:
-        similarity, psnr_db = _placed_by_images(splats, options.images, options.behind)
+    if options.images is not None and listed is not None:
+        similarity, psnr_db = _placed_by_images(splats, options.images, listed, options.behind)
     else:
         similarity = _placed_by_hand(file, options)
     placed = splats.moved(similarity).ordered()
@@ -112,12 +116,13 @@ def _placed_by_hand(file: Path, options: SplatOptions) -> Similarity:
     )
 
 
-def _placed_by_images(splats: GaussianSplats, images: Path, behind: Point) -> tuple[Similarity, float]:
+def _placed_by_images(
+    splats: GaussianSplats, images: Path, listed: PosedImages, behind: Point
+) -> tuple[Similarity, float]:
     """The similarity under which the splat shows the images best, and its median PSNR [dB].
 
     Splats are trained in the frame of the scan or of the data set, and some tools turn y and z around.
     """
-    listed = load_transforms(images)
     chosen = [
         listed.frames[k] for k in np.unique(np.linspace(0, len(listed.frames) - 1, _COMPARED).astype(int))
     ]

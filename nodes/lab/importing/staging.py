@@ -31,7 +31,7 @@ def work_folder(output: Path) -> Path:
 
 
 def build_beside(
-    output: Path, media: Sequence[Path], build: Callable[[Path], Built], resumes: bool = True
+    output: Path, inputs: Sequence[Path | None], build: Callable[[Path], Built], resumes: bool = True
 ) -> Built:
     """Build a data set in the work folder and move it to its destination.
 
@@ -39,14 +39,14 @@ def build_beside(
     resumes there. Other files in ``output`` are not touched. An earlier data set there is kept until the new one is complete.
 
     Args:
-        media: Input files, which must not be in the replaced folders.
+        inputs: Input files and folders, which must not be what is replaced, nor inside it; None is skipped.
         resumes: Whether a failed or stopped import may keep its work folder. Otherwise it is always removed.
 
     Raises:
         ImportRecordingError: A folder has other files, another import is running, or ``build`` failed and its work is kept.
     """
     work = work_folder(output)
-    _require_ours(output, work, media)
+    _require_ours(output, work, inputs)
     began_here = not work.exists()
     work.mkdir(parents=True, exist_ok=True)
     try:
@@ -76,13 +76,13 @@ def build_beside(
     return built
 
 
-def _require_ours(output: Path, work: Path, media: Sequence[Path]) -> None:
+def _require_ours(output: Path, work: Path, inputs: Sequence[Path | None]) -> None:
     """Check that the images in a folder are from an earlier import, because they are replaced. A user's photographs are never touched."""
-    for images in (output / IMAGES, output / MASKS, output / COLMAP, work):
-        inside = [path for path in media if path.resolve().is_relative_to(images.resolve())]
+    for own in (*(output / name for name in _ENTRIES), work):
+        inside = [path for path in inputs if path and path.resolve().is_relative_to(own.resolve())]
         if inside:
             raise ImportRecordingError(
-                f"expected media outside {images}, where the data set stores its copies; got {inside[0]}. Give another --output"
+                f"expected inputs outside {own}, where the data set stores its copies; got {inside[0]}. Give another --output"
             )
     # All of these are replaced.
     there = [output / name for name in _ENTRIES if _holds_files(output / name)]
