@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 # OpenGL cameras (nerfstudio, Instant-NGP, blender files) look along -z with y up; ours look along +z with y down.
 OPENGL_FROM_OPENCV: Array = np.diag([1.0, -1.0, -1.0, 1.0])
 OPENGL_FROM_OPENCV.setflags(write=False)
+# Half the side of an image over its focal length, at 170 degrees of view; also a fisheye's is far less.
+_WIDEST_SLOPE = 11.43
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,26 @@ class Pinhole:
         with np.errstate(divide="ignore", invalid="ignore"):
             uv = p[..., :2] / p[..., 2:3]
         return uv * np.array([self.fx, self.fy]) + np.array([self.cx, self.cy])
+
+
+def require_camera(pinhole: Pinhole) -> Pinhole:
+    """Intrinsics from a user's file, if a camera can have them. Those of a crop need not pass: its centre may be outside.
+
+    Raises:
+        ValueError: They are normalised, or belong to an image of another size.
+    """
+    size, focal, centre = (pinhole.width, pinhole.height), (pinhole.fx, pinhole.fy), (pinhole.cx, pinhole.cy)
+    wide = any(0.5 * side > _WIDEST_SLOPE * f for side, f in zip(size, focal, strict=True))
+    if wide or (min(size) > 2 and min(centre) > 0.0 and max(centre) <= 1.0):
+        cure = "if they are normalised, multiply fx and cx by the width, fy and cy by the height"
+    elif not all(0.0 <= c < side for side, c in zip(size, centre, strict=True)):
+        cure = "if they belong to a larger image, give its size as the image's"
+    else:
+        return pinhole
+    raise ValueError(
+        f"expected a focal length and a centre in pixels of an image of {size[0]} x {size[1]}, got fx {focal[0]:g}, fy {focal[1]:g}, "
+        f"cx {centre[0]:g}, cy {centre[1]:g}; {cure}"
+    )
 
 
 def wrap_angle(angle_rad: ArrayLike) -> Array:

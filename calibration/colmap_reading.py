@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import natural_order
 from advnerf_core.data.lens import Lens, straightening
-from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.geometry import Array, Pinhole, require_camera
 from calibration.colmap_files import check_binary_files, model_folders
 from calibration.colmap_lens import lens_of, pinhole_of
 from calibration.photo_model import MIN_IMAGES, FoundCamera, LeftOut, Model, ReconstructionError, Registered
@@ -87,6 +87,8 @@ def _converted(found: Any, folder: Path, sizes: dict[str, int], parts: int) -> C
     )
     counts = Counter(each.camera_id for each in images)
     lenses = {number: _intrinsics(found.cameras[number], folder) for number in sorted(counts)}
+    for number in lenses:
+        _require_camera(found.cameras[number], folder)
     cameras = tuple(
         _found_camera(number, found.cameras[number], lenses[number], counts[number]) for number in lenses
     )
@@ -123,6 +125,15 @@ def _registered(image: Any, lenses: Mapping[int, tuple[Pinhole, Lens]]) -> Regis
 def _found_camera(number: int, camera: Any, lens: tuple[Pinhole, Lens], count: int) -> FoundCamera:
     why = "as in the model" if lens_of(camera) else "no such lens here: its images are undistorted by COLMAP"
     return FoundCamera(str(number), count, camera.model_name, why, *lens, None)
+
+
+def _require_camera(camera: Any, folder: Path) -> None:
+    try:
+        require_camera(pinhole_of(camera))
+    except ValueError as error:
+        raise ReconstructionError(
+            f"{folder}: camera {camera.camera_id} ({camera.model_name}): {error}"
+        ) from None
 
 
 def _intrinsics(camera: Any, folder: Path) -> tuple[Pinhole, Lens]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import datetime
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -18,7 +18,7 @@ from advnerf_core.documents import Document, dump_yaml, parse_yaml, read_yaml
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.errors import AdvnerfError, ConfigError, MissingFileError
 from advnerf_core.files import write_atomically
-from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.geometry import Array, Pinhole, require_camera
 from advnerf_core.strict import Angle, StrictModel, at_most, validate, within_a_turn
 from calibration.fence import inside, require_simple
 from hardware.motor.limits import DriveLimits, VehicleGains
@@ -96,6 +96,11 @@ class Intrinsics(Calibration):
     cy: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     rms_px: float | None = Field(default=None, ge=0.0)
+
+    @model_validator(mode="after")
+    def _of_a_camera(self) -> Self:
+        require_camera(self.pinhole)
+        return self
 
     @property
     def pinhole(self) -> Pinhole:

@@ -23,7 +23,7 @@ from advnerf_core.data.scan_folder import from_scan_advice
 from advnerf_core.data.views import HELD_OUT_SPLITS, NGP_OFFSET, NGP_SCALE, TRAIN, PosedImages
 from advnerf_core.documents import read_json
 from advnerf_core.errors import ConfigError, MissingFileError
-from advnerf_core.geometry import OPENGL_FROM_OPENCV, Array, Pinhole
+from advnerf_core.geometry import OPENGL_FROM_OPENCV, Array, Pinhole, require_camera
 
 _LENSES = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _FISHEYES = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
@@ -282,14 +282,8 @@ def _pinhole(image: Path, values: _Values) -> Pinhole:
     fx, fy = _focal_length(values, "x", width), _focal_length(values, "y", height)
     if fx is None and fy is None:
         raise ValueError("fl_x: expected fl_x, camera_angle_x or x_fov, none is there")
-    return Pinhole(
-        width,
-        height,
-        fx or fy or 0.0,
-        fy or fx or 0.0,
-        _number(values, "cx", 0.5 * width),
-        _number(values, "cy", 0.5 * height),
-    )
+    centre = _number(values, "cx", 0.5 * width), _number(values, "cy", 0.5 * height)
+    return require_camera(Pinhole(width, height, fx or fy or 0.0, fy or fx or 0.0, *centre))
 
 
 def _focal_length(values: _Values, axis: str, size: int) -> float | None:

@@ -16,7 +16,7 @@ from advnerf_core.data.image_files import SUFFIXES
 from advnerf_core.data.lens import LONGEST_PX, Lens, straightening
 from advnerf_core.data.rigid import rigid_pose
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.geometry import Array, Pinhole, require_camera
 from calibration.photo_model import MIN_IMAGES, FoundCamera, LeftOut, Model, Registered
 
 # Formats of recordings have an image every few hundredths of a second.
@@ -123,7 +123,10 @@ def pinhole_of(width: Any, height: Any, values: Sequence[Any], where: str) -> Pi
         raise ScanError(
             f"{where}: expected an image size and focal lengths above 0 px, got {size[0]:g} x {size[1]:g} and {fx:g}, {fy:g}; export the scan again"
         )
-    return Pinhole(int(size[0]), int(size[1]), fx, fy, cx, cy)
+    try:
+        return require_camera(Pinhole(int(size[0]), int(size[1]), fx, fy, cx, cy))
+    except ValueError as error:
+        raise ScanError(f"{where}: {error}") from None
 
 
 def number(value: Any, where: str) -> float:

@@ -90,6 +90,33 @@ def test_crop_and_resize_move_the_same_point():
     np.testing.assert_allclose(view.project(point), [u * 200 / 336, (v - 40) * 66 / 111])
 
 
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ((240, 180, 0.708, 0.944, 0.5, 0.5), "if they are normalised"),
+        ((240, 180, 170.0, 170.0, 0.5, 0.5), "if they are normalised"),
+        ((336, 188, 1.7, 170.0, 168.0, 94.0), "if they are normalised"),
+        ((336, 188, 170.0, 170.0, 5000.0, 94.0), "larger image"),
+        ((120, 90, 170.0, 170.0, 120.0, 90.0), "larger image"),
+        ((120, 90, 170.0, 170.0, 60.0, -1.0), "larger image"),
+    ],
+)
+def test_intrinsics_that_no_camera_has_are_refused(values, why):
+    with pytest.raises(
+        ValueError, match=f"in pixels of an image of {values[0]} x {values[1]}, got fx .*{why}"
+    ):
+        g.require_camera(g.Pinhole(*values))
+
+
+@pytest.mark.parametrize("degrees", [0.2, 20.0, 120.0, 165.0])
+def test_cameras_from_telescopes_to_the_widest_lenses_pass(degrees):
+    f = 320.0 / np.tan(np.radians(degrees / 2))
+    for centre in ((320.0, 240.0), (0.0, 0.0), (639.5, 2.0)):
+        g.require_camera(g.Pinhole(640, 480, f, f, *centre))
+    fisheye = 640 / np.radians(235.0)  # equidistant: the angle is the radius over the focal length
+    g.require_camera(g.Pinhole(640, 480, fisheye, fisheye, 320.0, 240.0))
+
+
 def test_directions_are_the_inverse_of_projection():
     camera = g.Pinhole(4, 3, 5.0, 6.0, 1.9, 1.4)
     np.testing.assert_allclose(camera.project(camera.directions())[1, 2], [2.5, 1.5])

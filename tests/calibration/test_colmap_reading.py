@@ -68,6 +68,14 @@ def test_a_panorama_has_no_lens(tmp_path):
         read_colmap(write(model, tmp_path))
 
 
+def test_normalised_intrinsics_are_refused(tmp_path):
+    model = posed([look_at([k, 0.0, 1.0], [k, 5.0, 1.0]) for k in range(4)], "abcd")
+    model.cameras[1].model = "PINHOLE"
+    model.cameras[1].params = [0.7, 0.9, 0.5, 0.5]
+    with pytest.raises(ReconstructionError, match=r"camera 1 \(PINHOLE\): .*if they are normalised"):
+        read_colmap(write(model, tmp_path))
+
+
 def test_the_largest_of_several_models_is_read_unless_one_is_named(tmp_path):
     for number, frames in enumerate((4, 7, 5)):
         write(synthetic(frames, seed=number), tmp_path / "sparse" / str(number), text=number == 1)

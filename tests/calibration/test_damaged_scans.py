@@ -109,6 +109,11 @@ CASES = [
     ("LLFF", rows_edit(lambda rows: rows[:5]), "got 5 rows and 8 images; give the images of the poses"),
     ("LLFF", rows_edit(lambda rows: rows * np.nan), "expected finite numbers, got NaN or infinity"),
     ("LLFF", rows_edit(lambda rows: rows[:, :15]), r"expected numbers \[N, 17\], got float64 \[8, 15\]"),
+    (
+        "LLFF",
+        rows_edit(lambda rows: rows / np.where(np.arange(17) == 14, 64.0, 1.0)),
+        "if they are normalised",
+    ),
     ("LLFF", without("*.png"), "expected the folder images beside poses_bounds.npy"),
     ("EuRoC", text_edit("sensor.yaml", "radial-tangential", "fov"), "undistort the images first"),
     (
@@ -124,6 +129,11 @@ CASES = [
     ),
     ("EuRoC", without("state*/data.csv"), "expected poses in state_groundtruth_estimate0 or mocap0"),
     ("EuRoC", without("cam*/sensor.yaml"), "give its lens with --calibration camera.yaml"),
+    (
+        "TUM",
+        text_edit("calibration.txt", "50.0 51.0", "0.78 1.06"),
+        r"calibration\.txt: .*if they are normalised",
+    ),
     ("TUM", clocks_apart, "expected poses within 20 ms of the images, got poses at 1305031102"),
     ("TUM", without("calibration.txt"), r"expected the camera's lens in calibration\.txt"),
     ("TUM", without("*.png"), "got 8 names and none of the files"),
@@ -139,6 +149,11 @@ CASES = [
         "nerfstudio",
         json_edit("transforms.json", lambda each: each.update(camera_model="EQUIRECTANGULAR")),
         "camera_model: expected",
+    ),
+    (
+        "nerfstudio",
+        json_edit("transforms.json", lambda each: each.update(fl_x=0.78, fl_y=1.06, cx=0.5, cy=0.5)),
+        "if they are normalised",
     ),
     (
         "nerfstudio",

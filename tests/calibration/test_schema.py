@@ -88,6 +88,8 @@ def edited(tmp_path, name, **changes):
         ("camera", {"zoom": 2}, "unknown key zoom; valid keys here: .*width"),
         ("camera", {"fx": -1.0}, "fx"),
         ("camera", {"fx": float("nan")}, "fx"),
+        ("camera", {"fx": 1.7}, "got fx 1.7.*if they are normalised, multiply fx and cx by the width"),
+        ("camera", {"cx": 5000.0}, "cx 5000"),
         ("camera", {"date": ...}, "date"),
         ("camera", {"kind": "vehicle"}, "kind"),
         (

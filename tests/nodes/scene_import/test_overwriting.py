@@ -39,7 +39,8 @@ def test_an_input_is_never_overwritten(tmp_path, monkeypatch, capsys, words):
     write_ply(tmp_path / "a.ply", room(100))
     (tmp_path / "link.ply").symlink_to("a.ply")
     data_set(tmp_path / "set", room(100))
-    assert advnerf(monkeypatch, *"scene from-splat a.ply -o s.safetensors --metres-per-unit 1".split()) == 0
+    splat = "scene from-splat a.ply -o s.safetensors --metres-per-unit 1"
+    assert advnerf(monkeypatch, *splat.split()) == 0
     (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
     for name in ("o.png", "trace.mcap"):
         (tmp_path / name).write_bytes(b"anything")
