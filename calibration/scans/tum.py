@@ -1,7 +1,7 @@
 """Reads recordings in the layout of the TUM RGB-D benchmark, which ETH3D SLAM and others share.
 
 Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. A row of the trajectory is ``timestamp [s] tx ty tz [m] qx qy qz qw``, the pose of the colour camera, with
-OpenCV's axes, in a world with z up. ``rgb.txt`` and ``depth.txt`` list ``timestamp file``. Pixel centres are whole numbers.
+OpenCV's axes. ``groundtruth.txt`` is from motion capture: metric, z up. Others are from SLAM, whose unit and directions are its own. ``rgb.txt`` and ``depth.txt`` list ``timestamp file``. Pixel centres are whole numbers.
 """
 
 from __future__ import annotations
@@ -24,6 +24,11 @@ from calibration.scans.timed_images import Placed, TimedImage, place_images
 from calibration.scans.trajectory import Trajectory, stamp_ns, trajectory_of
 from calibration.schema import CameraCalibration, load_calibration
 
+_METRIC = "groundtruth.txt"
+_UNKNOWN = (
+    "unknown: lengths are in the unit of {file}, which monocular SLAM does not know; give --length, --positions or --marker, "
+    f"or rename the file to {_METRIC} if it is in metres with z up"
+)
 _LISTS, _FOLDERS = ("rgb.txt", "images.txt"), ("rgb", "images", "image_0", ".")
 _DEPTH_LIST, _CALIBRATION = "depth.txt", "calibration.txt"
 _VALUES_PER_M, _FARTHEST_M = 5000.0, 5.0
@@ -46,18 +51,19 @@ def read(path: Path, options: ScanOptions) -> Scan:
     placed = place_images(
         _timed(path, options), trajectory, "camera", partial(_intrinsics, path, options), options, np.eye(4)
     )
-    model = model_of(placed.images, placed.left_out, path, _depth(path, placed))
     facts = {"rows_without_pose": trajectory.dropped}
+    if trajectory.file.name != _METRIC:
+        model = model_of(placed.images, placed.left_out, path)
+        return Scan(model, placed.pictures, _UNKNOWN.format(file=trajectory.file.name), facts=facts)
+    model = model_of(placed.images, placed.left_out, path, _depth(path, placed))
     return Scan(model, placed.pictures, "metric: lengths of the trajectory", True, np.eye(3), facts=facts)
 
 
 def _trajectory(path: Path) -> Trajectory:
     files = trajectories(path)
-    if len(files) != 1 and files[0].name != "groundtruth.txt":
+    if len(files) != 1 and files[0].name != _METRIC:
         names = ", ".join(each.name for each in files)
-        raise ScanError(
-            f"{path}: expected one trajectory, got {names}; remove the others, or name one groundtruth.txt"
-        )
+        raise ScanError(f"{path}: expected one trajectory, got {names}; remove the others")
     rows = _numbers(files[0])
     if rows.shape[1] != 8:
         raise ScanError(

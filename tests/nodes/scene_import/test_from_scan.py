@@ -7,6 +7,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.lens import Lens
@@ -189,6 +190,33 @@ def test_tum(tmp_path, listed):
     frames, report = run(tmp_path, scan_samples.tum(tmp_path / "scan", listed))
     assert_same_pixels(frames, TRUTH)
     assert report["scan"] == {"format": "TUM", "rows_without_pose": 0}
+
+
+def test_a_trajectory_of_slam_has_its_own_unit_and_directions(tmp_path):
+    """Monocular SLAM begins at the first camera, and its unit of length is anything."""
+    scan = scan_samples.tum(tmp_path / "scan", depth=True)
+    rows = np.loadtxt(scan / "groundtruth.txt")
+    first = np.linalg.inv(TRUTH[0])
+    for row in rows:
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.from_quat(row[4:]).as_matrix(), row[1:4]
+        T = first @ T
+        row[1:4], row[4:] = 0.31 * T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat()
+    (scan / "groundtruth.txt").unlink()
+    np.savetxt(scan / "KeyFrameTrajectory.txt", rows, fmt="%.9f")
+    frames, report = run(tmp_path, scan)
+    similarity = aligned(frames)
+    assert similarity.scale == pytest.approx(1.0 / 0.31, rel=1e-4)
+    assert_same_pixels(frames, TRUTH, world=in_scan(similarity))
+    assert report["scale_from"] is None
+    assert report["scale"].startswith("unknown: lengths are in the unit of KeyFrameTrajectory.txt")
+    assert report["up"] == "the cameras' up"
+    np.testing.assert_allclose(similarity.T_target_from_source[2, :3], [0.0, 0.0, 1.0], atol=0.05)
+    names = sorted(frame.path.name for frame in frames)
+    length_m = float(np.linalg.norm(TRUTH[0][:3, 3] - TRUTH[5][:3, 3]))
+    frames, report = run(tmp_path, scan, length=(names[0], names[5], length_m))
+    assert aligned(frames).scale == pytest.approx(1.0, rel=1e-4)
+    assert report["scale_from"] == "length"
 
 
 def test_depth_images_of_tum_show_the_ground(tmp_path):
