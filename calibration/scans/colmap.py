@@ -12,6 +12,7 @@ from calibration.colmap_reading import ColmapModel, read_colmap, undistorted_ima
 from calibration.photo_model import LeftOut, Registered
 from calibration.scans.scan import Picture, Scan, ScanError, ScanOptions, spread
 
+OPTIONS = ("images", "model")
 _UNKNOWN = "unknown: lengths are in COLMAP's unit, not in metres; give --length, --positions or --marker"
 
 

@@ -33,6 +33,7 @@ from calibration.scans.timed_images import TimedImage, place_images
 from calibration.scans.trajectory import Trajectory, trajectory_of
 from calibration.schema import CameraCalibration, load_calibration
 
+OPTIONS = ("images", "calibration")
 # The first has been smoothed and belongs to the IMU.
 _POSES = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
 _POSE_COLUMNS = 8

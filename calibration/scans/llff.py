@@ -28,6 +28,7 @@ from calibration.scans.scan import (
     spread,
 )
 
+OPTIONS = ("images",)
 POSES = "poses_bounds.npy"
 _COLUMNS = 17
 _UNKNOWN = "unknown: lengths are in COLMAP's unit, not in metres; give --length, --positions or --marker"

@@ -32,6 +32,7 @@ from calibration.scans.scan import (
     spread,
 )
 
+OPTIONS: tuple[str, ...] = ()
 _DATAPARSER = "dataparser_transforms.json"
 _UNKNOWN = "unknown: lengths are in the file's unit; if that is not the metre, give --length, --positions or --marker"
 
@@ -43,10 +44,6 @@ def read(path: Path, options: ScanOptions) -> Scan:
         DatasetError: The file cannot be used.
         ScanError: Too few images, or a lens whose distortion cannot be undone.
     """
-    if options.images is not None:
-        raise ScanError(
-            f"{path}: expected no --images, as the file says where its images are; leave the option out"
-        )
     listed = load_transforms(path)
     found, pictures = list[Registered](), dict[str, Picture]()
     for index in spread(len(listed.frames), options.most):

@@ -33,6 +33,7 @@ from calibration.scans.scan import (
     spread,
 )
 
+OPTIONS = ("images",)
 # Undistortion leaves black pixels at the border; nerfstudio cuts off 15 of 1024.
 _BORDER_SHARE = 15 / 1024
 _VALUES_PER_M, _FARTHEST_M = 1000.0, 5.0  # of the LiDAR's depth images

@@ -31,6 +31,7 @@ from calibration.scans.scan import (
     spread,
 )
 
+OPTIONS: tuple[str, ...] = ()
 _METADATA, _FOLDERS = ("metadata", "metadata.json"), ("rgbd", "rgb")
 _LARGEST_BYTES = 2**26
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError, ValueError)

@@ -24,6 +24,7 @@ from calibration.scans.timed_images import Placed, TimedImage, place_images
 from calibration.scans.trajectory import Trajectory, stamp_ns, trajectory_of
 from calibration.schema import CameraCalibration, load_calibration
 
+OPTIONS = ("images", "calibration")
 _METRIC = "groundtruth.txt"
 _UNKNOWN = (
     "unknown: lengths are in the unit of {file}, which monocular SLAM does not know; give --length, --positions or --marker, "

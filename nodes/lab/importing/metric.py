@@ -21,6 +21,9 @@ from calibration.world_axes import Ground, find_ground, on_ground, upright
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.metric_options import MetricOptions
 
+# A scan's own metre is off by a few percent; more is another place, or another unit.
+_MOST_RESCALED = 2.0
+
 
 @dataclass(frozen=True)
 class OwnScale:
@@ -56,7 +59,7 @@ def place(
     known = R_upright_from_model if options.up == "auto" else None
     ground = _ground(model, options, known)
     if options.positions is not None:
-        return _at_positions(model, options.positions, ground)
+        return _at_positions(model, options.positions, ground, otherwise)
     up = "the cameras' up" if known is None else "that of the scan"
     if ground is not None:
         plane = f"a plane of {ground.points} points at z = 0"
@@ -70,6 +73,7 @@ def place(
         found = marker_scale(views(), options.marker_m, options.dictionary)
         scale, scale_from = found.scale, "fiducials"
         said = f"metric: {found.markers} markers of {options.marker_m:g} m, whose sides differ by {100 * found.spread:.2g} %"
+    said += _rescaled(scale, otherwise)
     similarity = on_ground(model, ground, scale) if known is None else upright(known, model, ground, scale)
     return similarity, _facts(said, scale_from, up, ground is not None)
 
@@ -85,13 +89,28 @@ def _ground(model: Model, options: MetricOptions, known: Array | None) -> Ground
     return ground
 
 
-def _at_positions(model: Model, file: Path, ground: Ground | None) -> tuple[Similarity, dict[str, Any]]:
+def _rescaled(scale: float, own: OwnScale) -> str:
+    """What an option changes in the metres of a scan that has them; empty for no change, or no metres."""
+    factor = scale / own.scale
+    if own.source is None or factor == 1.0:
+        return ""
+    if not 1.0 / _MOST_RESCALED <= factor <= _MOST_RESCALED:
+        raise ImportRecordingError(
+            f"expected a length that the scan agrees with, as it is in metres ({own.why}), got one that makes it {factor:.3g} times as large; "
+            "correct --length, --positions or --marker, or leave it out"
+        )
+    return f"; this makes the scan, which is in metres, {factor:.4g} times as large"
+
+
+def _at_positions(
+    model: Model, file: Path, ground: Ground | None, own: OwnScale
+) -> tuple[Similarity, dict[str, Any]]:
     positions = _read_positions(file)
     fit = fit_known_positions(model, positions, ground)
     said = (
         f"metric: known positions of {fit.images} images ({len(positions)} in the file), rms {fit.rms_m:.3g} m, "
         f"worst {fit.worst_m:.3g} m ({fit.worst})"
-    )
+    ) + _rescaled(fit.similarity.scale, own)
     up = "that of the known positions"
     if fit.on_line:
         up = (

@@ -55,3 +55,7 @@ class MetricOptions:
             raise ImportRecordingError(
                 f"expected one source of the scale, got {' and '.join(given)}; give one of them"
             )
+        if self.marker_m is None and self.dictionary != MetricOptions.dictionary:
+            raise ImportRecordingError(
+                f"expected --dictionary only with --marker, the size of its markers, got {self.dictionary}; add --marker METRES"
+            )

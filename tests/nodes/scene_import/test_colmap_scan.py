@@ -317,6 +317,19 @@ def test_wrong_options_are_one_line(tmp_path, ring, config, message):
     assert not (tmp_path / "out").exists()
 
 
+def test_the_lens_of_a_model_is_its_own(tmp_path, ring):
+    with pytest.raises(
+        ScanError, match=r"expected --images and --model for a scan of COLMAP, .* got --calibration"
+    ):
+        from_scan(
+            ring[0],
+            tmp_path / "out",
+            ScanOptions(ring[1], calibration=tmp_path),
+            MetricOptions(),
+            lambda *_: None,
+        )
+
+
 @pytest.mark.slow
 def test_photographs_that_colmap_posed_become_a_metric_scene(tmp_path):
     photographs, sparse = tmp_path / "photographs", tmp_path / "sparse"

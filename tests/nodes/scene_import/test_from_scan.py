@@ -18,6 +18,7 @@ from advnerf_core.data.views import HELD_OUT_SPLITS
 from advnerf_core.errors import AdvnerfError
 from calibration.scans.reading import READERS
 from calibration.scans.scan import ScanOptions
+from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import MediaConfig, gather
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.lab.importing.scan import from_scan
@@ -281,6 +282,42 @@ def test_a_known_length_gives_metres(tmp_path):
     )
     assert aligned(frames).scale == pytest.approx(1.0, rel=1e-6)
     assert report["scale_from"] == "length"
+
+
+def test_a_length_that_contradicts_a_metric_scan_is_said_or_refused(tmp_path):
+    scan, ends = scan_samples.polycam(tmp_path / "scan"), ("9876543.jpg", "13876543.jpg")
+    length_m = float(np.linalg.norm(TRUTH[0][:3, 3] - TRUTH[5][:3, 3]))
+    _, report = run(tmp_path, scan, length=(*ends, 1.03 * length_m))
+    assert report["scale"].endswith("; this makes the scan, which is in metres, 1.03 times as large")
+    positions = tmp_path / "gps.csv"
+    rows = [f"{9876543 + 800_000 * k}.jpg,{','.join(map(str, 100 * T[:3, 3]))}" for k, T in enumerate(TRUTH)]
+    positions.write_text("\n".join(["image,x_m,y_m,z_m", *rows]))
+    for known in ({"length": (*ends, 8.9 * length_m)}, {"positions": positions}):
+        with pytest.raises(
+            ImportRecordingError, match=r"a length that the scan agrees with.* times as large"
+        ):
+            run(tmp_path, scan, **known)
+    with pytest.raises(ImportRecordingError, match="expected --dictionary only with --marker"):
+        MetricOptions(dictionary="DICT_4X4_50")
+
+
+@pytest.mark.parametrize(
+    ("kind", "unused"),
+    [
+        ("Polycam", ("model", "calibration")),
+        ("Record3D", ("images", "model", "calibration")),
+        ("EuRoC", ("model",)),
+        ("nerfstudio", ("images", "model", "calibration")),
+        ("LLFF", ("model", "calibration")),
+        ("TUM", ("model",)),
+    ],
+)
+def test_an_option_that_the_format_does_not_use_is_refused(tmp_path, kind, unused):
+    scan = scan_samples.write(kind, tmp_path / "scan")
+    values = {"images": tmp_path, "model": "7", "calibration": calibration(tmp_path)}
+    for name in unused:
+        with pytest.raises(AdvnerfError, match=rf"for a scan of {kind}, .* got --{name}; leave it out"):
+            run(tmp_path, scan, ScanOptions(**{name: values[name]}))
 
 
 def test_an_image_that_is_damaged_is_left_out(tmp_path):
