@@ -35,6 +35,8 @@ _TURNS: dict[Axis, list[list[float]]] = {
 }
 _COMPARED, _COMPARED_PX = 8, 200  # images, and their width
 _LEAST_PSNR_DB = 14.0
+# From a coin on a table to a town: beyond, the unit is wrong.
+_SMALLEST_M, _LARGEST_M = 0.01, 10_000.0
 
 
 @dataclass(frozen=True)
@@ -75,9 +77,17 @@ def from_splat(file: Path, output: Path, options: SplatOptions) -> ImportedSplat
         similarity = _placed_by_hand(file, options)
     placed = splats.moved(similarity).ordered()
     low, high = central_box(placed)
+    if not _SMALLEST_M <= (size_m := float((high - low).max())) <= _LARGEST_M:
+        raise ImportRecordingError(
+            f"expected a scene of {_SMALLEST_M:g} to {_LARGEST_M:g} m, got {size_m:.3g} m with {similarity.scale:g} m a unit; correct --metres-per-unit"
+        )
     box = (options.box_low or _point(low), options.box_high or _point(high))
     if not all(a < b for a, b in zip(*box, strict=True)):
         raise ImportRecordingError(f"expected --box-low below --box-high, got {box[0]} and {box[1]}")
+    if not ((placed.means_m >= box[0]) & (placed.means_m <= box[1])).all(axis=1).any():
+        raise ImportRecordingError(
+            f"expected a box with Gaussians in it, got {box[0]} to {box[1]}; nearly all are in {_point(low)} to {_point(high)}"
+        )
     facts = {
         "file": file.name,
         "metres_per_unit": similarity.scale,

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from nodes.lab.importing.errors import ImportRecordingError
+
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 Point = tuple[float, float, float]
 
@@ -54,3 +56,10 @@ class SplatOptions:
     keep_floaters: Annotated[
         bool, typer.Option("--keep-floaters", help="Keep Gaussians that are far from all others.")
     ] = False
+
+    def __post_init__(self) -> None:
+        """Check the colour."""
+        if not all(0.0 <= channel <= 1.0 for channel in self.behind):
+            raise ImportRecordingError(
+                f"expected --behind as three numbers in 0..1, got {self.behind}; divide values of 0..255 by 255"
+            )

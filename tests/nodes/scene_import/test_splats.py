@@ -127,6 +127,23 @@ def test_a_splat_without_a_known_length_is_refused(tmp_path):
         from_splat(file, tmp_path / "s", SplatOptions(metres_per_unit=1.0, box_low=(9.0, 9.0, 9.0)))
 
 
+def test_what_no_scene_has_is_refused(tmp_path):
+    file, output = write_ply(tmp_path / "a.ply", room(60)), tmp_path / "s"
+    for wrong, message in (
+        ({"metres_per_unit": 1e4}, r"expected a scene of 0\.01 to 10000 m, got .* correct --metres-per-unit"),
+        ({"metres_per_unit": 1e-4}, r"expected a scene of 0\.01 to 10000 m"),
+        (
+            {"box_low": (50.0, 50.0, 50.0), "box_high": (60.0, 60.0, 60.0)},
+            r"a box with Gaussians in it, .* nearly all",
+        ),
+        ({"behind": (255.0, 255.0, 255.0)}, r"expected --behind as three numbers in 0\.\.1"),
+    ):
+        with pytest.raises(ImportRecordingError, match=message):
+            from_splat(file, output, SplatOptions(**{"metres_per_unit": 1.0, **wrong}))
+    assert not output.exists()
+    from_splat(file, output, SplatOptions(metres_per_unit=1.0, behind=(1.0, 0.5, 0.0)))
+
+
 def test_the_command_counts_what_it_leaves_out(tmp_path, monkeypatch, capsys):
     def told(*words):
         assert advnerf(monkeypatch, *map(str, words)) == 0
