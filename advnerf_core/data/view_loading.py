@@ -50,7 +50,7 @@ def load_view(frame: PosedImage, size: tuple[int, int] | None = None, keep_all: 
     rgb, alpha = read_stored(frame.path)
     height, width = rgb.shape[:2]
     pinhole = _pinhole_of_file(frame, width, height)
-    valid = None if frame.mask is None else _read_valid(frame, frame.mask, width, height)
+    valid = None if frame.mask is None else read_valid(frame.path, frame.mask, width, height)
     if not frame.lens.is_ideal:
         rgb, alpha, valid, pinhole = _straightened(frame, rgb, alpha, valid, pinhole, keep_all)
     if size is not None and size != (width, height):
@@ -72,15 +72,20 @@ def _pinhole_of_file(frame: PosedImage, width: int, height: int) -> Pinhole:
     return listed.resized(width, height)
 
 
-def _read_valid(frame: PosedImage, file: Path, width: int, height: int) -> NDArray[np.bool_]:
+def read_valid(image: Path, file: Path, width: int, height: int) -> NDArray[np.bool_]:
+    """Pixels ``[H, W]`` of an image that its mask keeps.
+
+    Raises:
+        DatasetError: The mask cannot be read, has another size, or keeps nothing.
+    """
     mask = read_mask(file)
     if mask.shape != (height, width):
         raise DatasetError(
-            f"expected a mask of {width} x {height}, the size of {frame.path}, got {file} of {mask.shape[1]} x {mask.shape[0]}"
+            f"expected a mask of {width} x {height}, the size of {image}, got {file} of {mask.shape[1]} x {mask.shape[0]}"
         )
     if not mask.any():
         raise DatasetError(
-            f"expected a mask with something that is not black, got {file}, which hides all of {frame.path}; "
+            f"expected a mask with something that is not black, got {file}, which hides all of {image}; "
             "leave this frame out of the file, or make the mask again"
         )
     return np.asarray(mask > 0)

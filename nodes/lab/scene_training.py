@@ -52,6 +52,7 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     for remark in training.remarks:
         print(remark)
     images = training.load(request.size)
+    held_out.load(request.size)  # an image that cannot be compared afterwards is an error now
     field = scene_field(request, training, images)
     march = sample_intervals(request, field, images)
     print(_described(request, field, march))

@@ -11,6 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig
@@ -86,6 +87,21 @@ def test_a_box_larger_than_the_unit_cube_means_unbounded_unless_told_otherwise(t
         for f in listed.frames
     ]
     np.testing.assert_allclose(scene_field(request_for(tmp_path), listed.with_frames(far)).box_high_m, 5.0)
+
+
+def test_a_held_out_image_that_cannot_be_compared_is_said_before_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_set(tmp_path, 9)
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"][8]["mask_path"] = "mask.png"
+    (folder / "transforms.json").write_text(json.dumps(content))
+    cv2.imwrite(str(folder / "mask.png"), np.full((20, 20), 255, np.uint8))
+    monkeypatch.setattr(scene_training, "train_scene", lambda *_: pytest.fail("it was trained"))
+    with pytest.raises(
+        DatasetError, match=r"expected a mask of 40 x 40, the size of .*08\.png, got .*mask\.png of 20 x 20"
+    ):
+        scene_training.train(request_for(folder), lambda *_: None)
 
 
 def test_unbounded_needs_no_box(tmp_path: Path) -> None:

@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.image_files import SUFFIXES, image_size, read_bytes, read_stored, write_image
+from advnerf_core.data.image_files import SUFFIXES, image_size, read_bytes, write_image
 from advnerf_core.data.similarity import extent
+from advnerf_core.data.view_loading import read_valid
 from advnerf_core.files import refuse_overwriting, write_atomically
 from advnerf_core.geometry import Pinhole
 from calibration.photo_model import MIN_IMAGES, LeftOut, Model, Registered
@@ -118,7 +119,7 @@ def _copied(image: Registered, picture: Picture, folder: Path) -> Registered:
     """Store an image: its file unchanged, or the pixels that replace it.
 
     Raises:
-        DatasetError: The image cannot be read.
+        DatasetError: The image or its mask cannot be used.
     """
     name = f"{IMAGES}/{picture.name}"
     copy = folder / name
@@ -132,7 +133,7 @@ def _copied(image: Registered, picture: Picture, folder: Path) -> Registered:
         else:
             pinhole = _same_size(image, picture, size)
         if picture.mask is not None:
-            read_stored(picture.mask)
+            read_valid(Path(picture.name), picture.mask, *size)
             write_atomically(folder / MASKS / f"{picture.name}.png", read_bytes(picture.mask))
     except DatasetError:
         copy.unlink(missing_ok=True)

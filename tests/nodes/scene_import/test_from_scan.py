@@ -257,6 +257,21 @@ def test_masks_go_along(tmp_path):
     )
 
 
+def test_a_mask_of_another_size_or_without_a_pixel_leaves_its_image_out(tmp_path):
+    scan = scan_samples.nerfstudio(tmp_path / "scan", masks=True)
+    masks = sorted((scan / "masks").iterdir())
+    assert cv2.imwrite(str(masks[0]), np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8))
+    assert cv2.imwrite(str(masks[3]), np.zeros((HEIGHT, WIDTH), np.uint8))
+    frames, report = run(tmp_path, scan)
+    assert len(frames) == 6
+    first, second = report["model"]["left_out"]
+    assert first["why"].startswith(
+        f"expected a mask of {WIDTH} x {HEIGHT}, the size of frame_00001.png, got {masks[0]}"
+    )
+    assert second["why"].startswith("expected a mask with something that is not black")
+    load_transforms(tmp_path / "out").load()
+
+
 def test_the_world_of_a_trained_model_is_found_again(tmp_path):
     scan = scan_samples.nerfstudio(tmp_path / "scan")
     content = json.loads((scan / "transforms.json").read_text())
