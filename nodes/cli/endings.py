@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 import shlex
 from collections.abc import Sequence
 
@@ -48,10 +49,24 @@ def usage_text(error: Exception) -> str | None:
         return None
     if type(error).__name__ == "NoArgsIsHelpError":
         return ""  # the help was printed
-    text = str(error.format_message()).strip().rstrip(".")
+    text = _with_value(error, str(error.format_message()).strip().rstrip("."))
     context = getattr(error, "ctx", None)
     help_of = "" if context is None else f"; see {context.command_path} --help"
     return f"{text[:1].lower()}{text[1:]}{help_of}"
+
+
+def _with_value(error: Exception, text: str) -> str:
+    """The text with the value that pydantic, which newer versions of typer parse with, leaves out; and how several are written."""
+    found = getattr(error.__cause__, "errors", list)()
+    about, short, wanted = text.partition(": Input should be ")
+    if found and short:
+        wanted = wanted.partition(", unable to parse")[0]
+        kind = "" if wanted.startswith(("a ", "an ")) else "a value "
+        text = f"{about}: expected {kind}{wanted}, got {found[0]['input']!r}"
+    count = getattr(getattr(error, "param", None), "nargs", 1)
+    if count > 1:
+        text += f"; separate its {count} values by spaces"
+    return re.sub(r"(requires \d+ arguments)$", r"\1, separated by spaces", text)
 
 
 def text_for_people(error: Exception) -> str | None:

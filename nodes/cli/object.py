@@ -74,6 +74,7 @@ def object_build(
         tuple[int, int] | None,
         typer.Option(
             min=1,
+            metavar="WIDTH HEIGHT",
             help="With --images: resize the images to this width and height. For the object itself, see --resolution.",
             show_default="as they are",
         ),

@@ -41,7 +41,12 @@ SceneFile = Annotated[
 ]
 Size = Annotated[
     tuple[int, int] | None,
-    typer.Option("--size", help="Resize the images to this width and height.", show_default="their size"),
+    typer.Option(
+        "--size",
+        metavar="WIDTH HEIGHT",
+        help="Resize the images to this width and height.",
+        show_default="their size",
+    ),
 ]
 Every = Annotated[int, typer.Option("--every", min=2, help="Every N-th image is held out.")]
 IntervalScale = Annotated[

@@ -12,7 +12,8 @@ from advnerf_core.places import require_utf8
 from nodes.runtime.errors import ConfigError
 
 Corner = Annotated[
-    tuple[float, float, float] | None, typer.Option(help="Corner of the scene box, in the unit of the file.")
+    tuple[float, float, float] | None,
+    typer.Option(metavar="X Y Z", help="Corner of the scene box, in the unit of the file."),
 ]
 _DEFAULT_STEPS = 1000
 
@@ -40,7 +41,11 @@ class TrainingRequest:
     box_high: Corner = None
     size: Annotated[
         tuple[int, int] | None,
-        typer.Option(help="Resize the images to this width and height.", show_default="their size"),
+        typer.Option(
+            metavar="WIDTH HEIGHT",
+            help="Resize the images to this width and height.",
+            show_default="their size",
+        ),
     ] = None
     open_scene: Annotated[bool, typer.Option("--open", help="Outdoor scene: rays may leave the box.")] = False
     every: Annotated[int, typer.Option(min=2, help="Every N-th image is held out.")] = 8
@@ -88,6 +93,7 @@ class TrainingRequest:
     interval: Annotated[
         tuple[float, float] | None,
         typer.Option(
+            metavar="SHORTEST LONGEST",
             help="Shortest and longest sample interval, in the unit of the file.",
             show_default="1/1024 and 1/64 of the box",
         ),

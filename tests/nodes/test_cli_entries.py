@@ -125,6 +125,31 @@ def test_a_stop_with_a_wrong_option_says_that_nothing_is_confirmed() -> None:
     [
         (("bag", "play"), 2, r"error: missing argument 'BAG'; see .* bag play --help"),
         (("bag", "play", ".", "--rate", "-1"), 2, r"error: invalid value for '--rate': .*; see .* --help"),
+        (
+            ("scene", "train", ".", "-o", "x", "--box-low", "3,3,3", "--box-high", "4,4,4"),
+            2,
+            r"error: invalid value for '--box-low': expected a valid number, got '3,3,3'; separate its 3 values by spaces; see .* --help",
+        ),
+        (
+            ("scene", "train", ".", "-o", "x", "--box-low", "3,3,3"),
+            2,
+            r"error: option '--box-low' requires 3 arguments, separated by spaces(; see .* --help)?",
+        ),
+        (
+            ("scene", "from-scan", ".", "-o", "x", "--length", "A", "B", "3m"),
+            2,
+            r"error: invalid value for '--length': expected a valid number, got '3m'; separate its 3 values by spaces; see .* --help",
+        ),
+        (
+            ("scene", "train", ".", "-o", "x", "--every", "x"),
+            2,
+            r"error: invalid value for '--every': expected a valid integer, got 'x'; see .* --help",
+        ),
+        (
+            ("scene", "train", ".", "-o", "x", "--every", "1"),
+            2,
+            r"error: invalid value for '--every': expected a value greater than or equal to 2, got '1'; see .* --help",
+        ),
         (("car", "fly"), 2, r"error: no such command 'fly'; see .* car --help"),
         (("audit", "a:b", "--no-such-option"), 64, r"error: no such option: --no-such-option; see .* --help"),
     ],

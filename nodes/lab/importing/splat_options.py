@@ -42,17 +42,28 @@ class SplatOptions:
     origin: Annotated[
         Point | None,
         typer.Option(
-            help="Point of the file that becomes the origin, on the ground.", show_default="the file's"
+            metavar="X Y Z",
+            help="Point of the file that becomes the origin, on the ground.",
+            show_default="the file's",
         ),
     ] = None
     box_low: Annotated[
         Point | None,
-        typer.Option(help="Low corner of the scene's box [m].", show_default="around nearly all Gaussians"),
+        typer.Option(
+            metavar="X Y Z",
+            help="Low corner of the scene's box [m].",
+            show_default="around nearly all Gaussians",
+        ),
     ] = None
     box_high: Annotated[
-        Point | None, typer.Option(help="High corner [m].", show_default="around nearly all Gaussians")
+        Point | None,
+        typer.Option(metavar="X Y Z", help="High corner [m].", show_default="around nearly all Gaussians"),
     ] = None
-    behind: Annotated[Point, typer.Option(help="Colour behind everything, 0..1.")] = (0.0, 0.0, 0.0)
+    behind: Annotated[Point, typer.Option(metavar="R G B", help="Colour behind everything, 0..1.")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
     keep_floaters: Annotated[
         bool, typer.Option("--keep-floaters", help="Keep Gaussians that are far from all others.")
     ] = False
