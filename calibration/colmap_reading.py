@@ -161,8 +161,8 @@ def _intrinsics(camera: Any, folder: Path) -> tuple[Pinhole, Lens]:
     return pinhole, lens
 
 
-def undistorted_image(file: Path, camera: Any) -> NDArray[np.uint8]:
-    """Pixels ``[H, W, 3]`` of an image without the distortion of its pycolmap camera.
+def undistorted_image(file: Path, camera: Any) -> tuple[NDArray[np.uint8], Pinhole]:
+    """Pixels ``[H, W, 3]`` of an image, which may be reduced, without the distortion of its pycolmap camera, and their intrinsics.
 
     Raises:
         DatasetError: The image cannot be read.
@@ -172,5 +172,7 @@ def undistorted_image(file: Path, camera: Any) -> NDArray[np.uint8]:
     bitmap = pycolmap.Bitmap.read(file, True)
     if bitmap is None:
         raise DatasetError(f"{file}: expected an image that COLMAP can read; export it as PNG or JPEG")
-    straight, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, camera)
-    return np.asarray(straight.to_array(), np.uint8)
+    of_image = copy.deepcopy(camera)
+    of_image.rescale(bitmap.width, bitmap.height)
+    straight, ideal = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, of_image)
+    return np.asarray(straight.to_array(), np.uint8), pinhole_of(ideal)

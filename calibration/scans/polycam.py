@@ -87,7 +87,7 @@ def _keyframe(file: Path, image: Path, corrected: bool, digits: int) -> tuple[Re
     whole = pinhole_of(values["width"], values["height"], [values[key] for key in keys[-4:]], str(file))
     pinhole, edited = whole, None
     if corrected:
-        pinhole, edited = _without_border(whole), partial(_pixels_without_border, image)
+        pinhole, edited = _without_border(whole), partial(_pixels_without_border, image, whole)
     one = Registered(image.name, "phone", T @ OPENGL_FROM_OPENCV, pinhole, Lens())
     name = f"{image.stem.zfill(digits)}{image.suffix}"  # in the order of time
     picture = Picture(name, partial(read_bytes, image), whole.width, whole.height, edited)
@@ -103,7 +103,8 @@ def _without_border(pinhole: Pinhole) -> Pinhole:
     return pinhole.cropped(px, px, pinhole.width - 2 * px, pinhole.height - 2 * px)
 
 
-def _pixels_without_border(image: Path) -> NDArray[np.uint8]:
+def _pixels_without_border(image: Path, whole: Pinhole) -> tuple[NDArray[np.uint8], Pinhole]:
     rgb: NDArray[Any] = read_stored(image)[0]
-    px = _border_px(rgb.shape[1])
-    return rgb[px : rgb.shape[0] - px, px : rgb.shape[1] - px]
+    height, width = rgb.shape[:2]
+    px = _border_px(width)
+    return rgb[px : height - px, px : width - px], _without_border(whole.resized(width, height))

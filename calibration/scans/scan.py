@@ -53,7 +53,7 @@ class Picture:
         content: Returns the content of the image file.
         width: Width of the file's image [px].
         height: Height of the file's image [px].
-        edited: Returns pixels ``[H, W, 3]`` to store instead; None to store the file.
+        edited: Returns pixels ``[H, W, 3]`` to store instead, and their intrinsics; None to store the file.
         mask: File whose black pixels do not count.
         split: ``train``, ``val`` or ``test``.
     """
@@ -62,7 +62,7 @@ class Picture:
     content: Callable[[], bytes]
     width: int
     height: int
-    edited: Callable[[], NDArray[np.uint8]] | None = None
+    edited: Callable[[], tuple[NDArray[np.uint8], Pinhole]] | None = None
     mask: Path | None = None
     split: str | None = None
 

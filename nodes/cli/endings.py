@@ -58,6 +58,7 @@ def usage_text(error: Exception) -> str | None:
 def _with_value(error: Exception, text: str) -> str:
     """The text with the value that pydantic, which newer versions of typer parse with, leaves out; and how several are written."""
     found = getattr(error.__cause__, "errors", list)()
+    text = text.replace(": Value error, ", ": ")
     about, short, wanted = text.partition(": Input should be ")
     if found and short:
         wanted = wanted.partition(", unable to parse")[0]

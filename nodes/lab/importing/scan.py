@@ -120,39 +120,38 @@ def _copied(image: Registered, picture: Picture, folder: Path) -> Registered:
 
     Raises:
         DatasetError: The image or its mask cannot be used.
+        ScanError: The image has another shape.
     """
     name = f"{IMAGES}/{picture.name}"
     copy = folder / name
     write_atomically(copy, picture.content())
     try:
         size = image_size(copy)
+        pinhole = _same_size(image, picture, size)
         if picture.edited is not None:
-            _same_size(image, picture, size, exactly=True)
-            write_image(copy, picture.edited())
-            pinhole = image.pinhole
-        else:
-            pinhole = _same_size(image, picture, size)
+            pixels, pinhole = picture.edited()
+            write_image(copy, pixels)
         if picture.mask is not None:
             read_valid(Path(picture.name), picture.mask, *size)
             write_atomically(folder / MASKS / f"{picture.name}.png", read_bytes(picture.mask))
-    except DatasetError:
+    except (DatasetError, ScanError):
         copy.unlink(missing_ok=True)
         raise
     return replace(image, name=name, pinhole=pinhole)
 
 
-def _same_size(image: Registered, picture: Picture, size: tuple[int, int], exactly: bool = False) -> Pinhole:
+def _same_size(image: Registered, picture: Picture, size: tuple[int, int]) -> Pinhole:
     """Intrinsics for the image in its current size, which may be smaller than the scan's.
 
     Raises:
-        ImportRecordingError: The image has another shape.
+        ScanError: The image has another shape.
     """
     width, height = size
     if size == (picture.width, picture.height):
         return image.pinhole
     factor = width / picture.width
-    if exactly or factor >= 1.0 or abs(height - factor * picture.height) > _ROUNDING_PX:
-        raise ImportRecordingError(
+    if factor >= 1.0 or abs(height - factor * picture.height) > _ROUNDING_PX:
+        raise ScanError(
             f"{picture.name}: expected {picture.width} x {picture.height} pixels as camera {image.camera_id} of the scan has, got {width} x {height}; "
             "give the images that the poses belong to"
         )

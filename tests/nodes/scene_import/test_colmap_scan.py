@@ -251,6 +251,44 @@ def test_images_of_lenses_without_a_model_are_undistorted_by_colmap(tmp_path, na
         assert frame.pinhole.fx == pytest.approx(camera.focal_length_x, abs=1e-6)
 
 
+@pytest.mark.parametrize("name", ["FOV", "FULL_OPENCV"])
+def test_reduced_images_of_such_lenses_keep_their_rays(tmp_path, name):
+    def colours(x, y):
+        return np.rint(
+            np.stack([128 + 90 * np.sin(4 * x), 128 + 90 * np.sin(4 * y), 128 + 90 * np.cos(3 * x + y)], -1)
+        )
+
+    model = synthetic(name=name, params=OTHER_CAMERAS[name])
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.array([model.cameras[1].cam_from_img(each) for each in np.c_[u.ravel(), v.ravel()]])
+    whole = colours(*rays[:, :2].T).reshape(HEIGHT, WIDTH, 3).astype(np.uint8)
+    half = cv2.resize(whole, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_AREA)
+    for image in (names := sorted(poses_by_name(model))):
+        (tmp_path / "half" / image).parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(tmp_path / "half" / image), half[..., ::-1])
+    run(tmp_path, write(model, tmp_path / "model"), tmp_path / "half")
+    frames = loaded(tmp_path)[0]
+    assert len(frames) == len(names)
+    for frame in frames.values():
+        seen = read_stored(frame.path)[0]
+        assert frame.lens.is_ideal
+        assert seen.shape == (frame.pinhole.height, frame.pinhole.width, 3)
+        directions = frame.pinhole.directions()
+        away = np.abs(seen - colours(directions[..., 0], directions[..., 1]))[2:-2, 2:-2]
+        assert away.mean() < 2.0, "half a pixel is 4"
+
+
+def test_one_image_of_another_size_leaves_the_others(tmp_path, ring):
+    write_images(ring[1], NAMES[2:3], (WIDTH, HEIGHT - 8))
+    run(tmp_path, *ring)
+    frames, report = loaded(tmp_path)
+    assert set(frames) == {*NAMES} - {NAMES[2]}
+    (left_out,) = report["model"]["left_out"]
+    assert left_out["why"].startswith(
+        f"{NAMES[2]}: expected 64 x 48 pixels as camera 1 of the scan has, got 64 x 40"
+    )
+
+
 def test_folders_of_a_person_are_never_replaced(tmp_path, ring):
     (tmp_path / "out" / "colmap" / "sparse").mkdir(parents=True)
     with pytest.raises(ImportRecordingError, match="out has other files: colmap; give another --output"):

@@ -111,6 +111,20 @@ def test_polycam(tmp_path):
     assert report["up"].startswith("that of the scan; the ground is a plane of")
 
 
+def test_reduced_images_of_polycam_keep_their_rays(tmp_path):
+    scan = scan_samples.polycam(tmp_path / "scan")
+    for number, file in enumerate(sorted((scan / "keyframes" / "corrected_images").iterdir())):
+        scan_samples.write_image(file, number, (WIDTH // 2, HEIGHT // 2))
+    frames, _ = run(tmp_path, scan)
+    for frame in frames:  # the border is less than half a pixel
+        assert (frame.pinhole.width, frame.pinhole.fx, frame.pinhole.cx) == (
+            WIDTH // 2,
+            K[0, 0] / 2,
+            K[0, 2] / 2,
+        )
+        assert read_stored(frame.path)[0].shape == (HEIGHT // 2, WIDTH // 2, 3)
+
+
 def test_polycam_without_correction_and_depth(tmp_path):
     frames, report = run(tmp_path, scan_samples.polycam(tmp_path / "scan", corrected=False, depth=False))
     assert_same_pixels(frames, TRUTH, world=moved_to(ORIGIN))
