@@ -16,7 +16,7 @@ from nodes.cli import world as cli_world
 from nodes.cli.panels import in_panels
 from nodes.lab.training_request import TrainingRequest
 from nodes.runtime.options import with_groups
-from nodes.runtime.terminal import listen_address, print_table, table
+from nodes.runtime.terminal import listen_address, print_table, scene_argument, table
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -37,7 +37,7 @@ for name, group in (("object", cli_object), ("world", cli_world), ("room", cli_r
 
 DataSet = Annotated[Path, typer.Argument(help="A transforms.json, or its folder.", exists=True)]
 SceneFile = Annotated[
-    Path, typer.Argument(help="A scene file (scene.safetensors).", exists=True, dir_okay=False)
+    Path, typer.Argument(help="A scene file (scene.safetensors).", exists=True, callback=scene_argument)
 ]
 Size = Annotated[
     tuple[int, int] | None,

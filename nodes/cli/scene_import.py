@@ -12,7 +12,7 @@ import typer
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.lab.importing.splat_options import SplatOptions
 from nodes.runtime.options import with_groups
-from nodes.runtime.terminal import print_table, table
+from nodes.runtime.terminal import print_table, scene_argument, table
 
 if TYPE_CHECKING:
     from nodes.lab.importing.data_set import Facts
@@ -256,7 +256,10 @@ def from_splat(
 @app.command("match-colours")
 def match_colours(
     scene: Annotated[
-        Path, typer.Argument(help="Scene file learned from the phone's images.", exists=True, dir_okay=False)
+        Path,
+        typer.Argument(
+            help="Scene file learned from the phone's images.", exists=True, callback=scene_argument
+        ),
     ],
     images: Annotated[
         Path,

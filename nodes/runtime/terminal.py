@@ -57,6 +57,24 @@ def policy_argument(text: str) -> str:
     return text
 
 
+def scene_argument(path: Path) -> Path:
+    """A scene file; for a folder, an error that names its scene file, or the command that makes one."""
+    from advnerf_core.data.scan_folder import DATA_SET, from_scan_advice, scan_of
+
+    if not path.is_dir():
+        return path
+    scene = "scene.safetensors"
+    learned = next((each for pattern in (scene, f"*/{scene}") for each in sorted(path.glob(pattern))), None)
+    advice = from_scan_advice(
+        path, "give a scene.safetensors, which 'advnerf scene train' and 'from-splat' write"
+    )
+    if learned is not None:
+        advice = f"give {learned}"
+    elif (found := scan_of(path)) is not None and found.name == DATA_SET:
+        advice = f"it holds images, so run: advnerf scene train {path} -o {path / 'learned'}"
+    raise typer.BadParameter(f"expected a scene file, got the folder {path}; {advice}")
+
+
 PolicyName = Annotated[
     str,
     typer.Argument(

@@ -162,6 +162,40 @@ def test_a_wrong_command_line_is_one_line_as_every_other_error(
     assert re.fullmatch(text, errors.strip(), re.IGNORECASE), errors
 
 
+@pytest.mark.parametrize("words", ["view", "eval {} x", "render {} x -o x", "match-colours {} x"])
+@pytest.mark.parametrize(
+    ("made", "advice"),
+    [
+        ("learned/scene.safetensors", "give {folder}/learned/scene.safetensors"),
+        ("transforms.json", "it holds images, so run: advnerf scene train {folder} -o {folder}/learned"),
+        (
+            "poses_bounds.npy",
+            "it is of the format LLFF, so run: advnerf scene from-scan {folder} -o NEW_FOLDER",
+        ),
+        ("a.txt", "give a scene.safetensors, which 'advnerf scene train' and 'from-splat' write"),
+    ],
+)
+def test_a_folder_for_a_scene_file_is_told_what_makes_one(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    words: str,
+    made: str,
+    advice: str,
+) -> None:
+    file = tmp_path / made
+    file.parent.mkdir(exist_ok=True)
+    file.touch()
+    monkeypatch.chdir(tmp_path)
+    Path("x").touch()
+    command = words.format(tmp_path) if "{}" in words else f"{words} {tmp_path}"
+    assert advnerf(monkeypatch, "scene", *command.split()) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert (
+        f"expected a scene file, got the folder {tmp_path}; {advice.format(folder=tmp_path)}; see " in error
+    )
+
+
 def test_a_shell_completes_groups_and_commands() -> None:
     for typed, expected in (("advnerf car cal", "calibrate"), ("advnerf car calibrate veh", "vehicle")):
         environment = {"_ADVNERF_COMPLETE": "complete_bash"}
