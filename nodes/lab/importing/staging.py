@@ -36,7 +36,7 @@ def build_beside(
     """Build a data set in the work folder and move it to its destination.
 
     A stopped import keeps its work folder if structure from motion or the selection of video frames had started, and the next import
-    resumes there. Other files in ``output`` are not touched. An earlier data set there is kept until the new one is complete.
+    resumes there. Other files in ``output`` are not touched. An earlier data set there is kept until the new one is complete; it is said if they differ.
 
     Args:
         inputs: Input files and folders, which must not be what is replaced, nor inside it; None is skipped.
@@ -72,8 +72,17 @@ def build_beside(
                     f"{error}. Finished work is kept in {work}: run the same command to resume"
                 ) from error
             raise
+        changed = _content(output / TRANSFORMS) not in (None, _content(work / TRANSFORMS))
         _move(work, output)
+    if changed:
+        print(
+            f"{output}: replaced an earlier data set; what was learned from that one does not fit: learn it again"
+        )
     return built
+
+
+def _content(file: Path) -> bytes | None:
+    return file.read_bytes() if file.is_file() else None
 
 
 def _require_ours(output: Path, work: Path, inputs: Sequence[Path | None]) -> None:

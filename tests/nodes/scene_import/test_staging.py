@@ -53,6 +53,22 @@ def test_a_data_set_appears_whole_and_what_else_lies_there_stays(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
 
 
+def test_a_data_set_that_becomes_another_is_said(tmp_path, capsys):
+    for content, told in (
+        ("{}", ""),
+        ("{}", ""),
+        ('{"a": 1}', "replaced an earlier data set; what was learned"),
+    ):
+
+        def build(folder, content=content):
+            whole(folder)
+            (folder / "transforms.json").write_text(content)
+
+        build_beside(tmp_path / "scene", (), build, resumes=False)
+        assert told in (said := capsys.readouterr().out)
+        assert bool(told) == bool(said)
+
+
 @pytest.mark.parametrize("resumes", [True, False])
 def test_a_failed_import_leaves_nothing_and_the_earlier_one_whole(tmp_path, resumes):
     def fail(folder):
