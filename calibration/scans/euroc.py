@@ -6,6 +6,7 @@ has the pose of that sensor in the world: ``timestamp [ns], p x y z [m], q w x y
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.scan_folder import euroc_root
-from advnerf_core.documents import read_csv, read_yaml
+from advnerf_core.documents import parse_yaml, read_csv, read_text
 from advnerf_core.geometry import Array, Pinhole, invert_transform
 from calibration.photo_model import LeftOut, Registered
 from calibration.scans.scan import (
@@ -131,12 +132,17 @@ def _timed(camera: Path, options: ScanOptions) -> Sequence[TimedImage]:
 def _sensor(folder: Path) -> dict[str, Any]:
     """Content of a sensor's ``sensor.yaml``; empty without one."""
     file = folder / "sensor.yaml"
-    content = read_yaml(file).data if file.is_file() else {}
+    content = parse_yaml(_without_opencv(read_text(file)), str(file)).data if file.is_file() else {}
     if not isinstance(content, dict):
         raise ScanError(
             f"{file}: expected keys and values, got {type(content).__name__}; copy the file again"
         )
     return content
+
+
+def _without_opencv(text: str) -> str:
+    """Plain YAML of a file of OpenCV's ``FileStorage``: its first line and the tag of its matrices are its own; lines keep their numbers."""
+    return re.sub(r"\A%YAML:1\.0|!!opencv-matrix\b", "", text)
 
 
 def _in_body(folder: Path, sensor: dict[str, Any]) -> Array:

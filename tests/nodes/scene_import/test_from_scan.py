@@ -188,6 +188,20 @@ def test_markers_on_the_body_of_euroc_are_not_its_camera(tmp_path):
     assert_same_pixels(frames, TRUTH, BROWN)
 
 
+@pytest.mark.parametrize("head", ["%YAML:1.0\n", "%YAML:1.0\n---\n"])
+def test_sensors_of_euroc_that_opencv_wrote(tmp_path, head):
+    scan = scan_samples.euroc(tmp_path / "scan", cameras=("cam0",))
+    for file in scan.rglob("sensor.yaml"):
+        text = file.read_text().split("\n", 1)[1].replace("T_BS:\n", "T_BS: !!opencv-matrix\n   dt: d\n")
+        file.write_text(
+            head + text.replace("  cols", "   cols").replace("  rows", "   rows").replace("  data", "   data")
+        )
+    sensor = cv2.FileStorage(str(scan / "mav0" / "cam0" / "sensor.yaml"), cv2.FILE_STORAGE_READ)
+    assert sensor.getNode("T_BS").mat().shape == (4, 4), "OpenCV reads what we read"
+    frames, _ = run(tmp_path, scan)
+    assert_same_pixels(frames, TRUTH, BROWN)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_training_takes_the_data_set_without_a_box(tmp_path, kind):
     run(tmp_path, scan_samples.write(kind, tmp_path / "scan"))
