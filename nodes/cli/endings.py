@@ -6,6 +6,7 @@ import errno
 import re
 import shlex
 from collections.abc import Sequence
+from typing import Any
 
 from advnerf_core.errors import AdvnerfError
 
@@ -57,7 +58,7 @@ def usage_text(error: Exception) -> str | None:
 
 def _with_value(error: Exception, text: str) -> str:
     """The text with the value that pydantic, which newer versions of typer parse with, leaves out; and how several are written."""
-    found = getattr(error.__cause__, "errors", list)()
+    found: list[dict[str, Any]] = getattr(error.__cause__, "errors", list)()
     text = text.replace(": Value error, ", ": ")
     about, short, wanted = text.partition(": Input should be ")
     if found and short:
