@@ -118,7 +118,7 @@ def scene_render(
 
     renderer = load_renderer(scene, interval_scale)
     listed = load_transforms(transforms)
-    refuse_overwriting([scene, *listed.files], [video])
+    refuse_overwriting([scene, *listed.files], [] if video is None else [video])
     listed = listed.training_and_held_out(every)[1] if held_out else listed.sorted_by_name()
     with ProgressDisplay() as display:
         count = render(renderer, listed, size, output, video, display.start("render"))

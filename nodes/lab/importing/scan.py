@@ -10,7 +10,7 @@ from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import SUFFIXES, image_size, read_bytes, write_image
 from advnerf_core.data.similarity import extent
 from advnerf_core.data.view_loading import read_valid
-from advnerf_core.files import refuse_overwriting, write_atomically
+from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Pinhole
 from calibration.photo_model import MIN_IMAGES, LeftOut, Model, Registered
 from calibration.scans.reading import read_scan
@@ -64,7 +64,10 @@ def from_scan(path: Path, output: Path, options: ScanOptions, metric: MetricOpti
         poses, points = similarity.poses(kept.poses), similarity.points(kept.points)
         return write_model_set(folder, kept, poses, points, facts, pictures, similarity.points(scan.reached))
 
-    refuse_overwriting([path], [output])
+    if path.resolve() == output.resolve():
+        raise ImportRecordingError(
+            f"expected an --output that is not the scan itself, got {output}; give another folder"
+        )
     inputs = [path, options.images, options.calibration, metric.positions]
     return build_beside(output, inputs, build, resumes=False)
 
