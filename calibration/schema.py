@@ -9,7 +9,7 @@ from __future__ import annotations
 import datetime
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -98,7 +98,7 @@ class Intrinsics(Calibration):
     rms_px: float | None = Field(default=None, ge=0.0)
 
     @model_validator(mode="after")
-    def _of_a_camera(self) -> Self:
+    def _of_a_camera(self) -> Intrinsics:
         require_camera(self.pinhole)
         return self
 

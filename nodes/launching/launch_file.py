@@ -137,7 +137,8 @@ def _apply_override(document: Document, override: str) -> None:
         rest = name.split(".", 1)[1]
         prefix = (head,) if _is_about_the_process(rest, value, document, override) else (head, "config")
         apply_overrides(document, [f"{'.'.join((*prefix, rest))}={value}"], ("nodes",))
-        document.places[("nodes", *prefix, *rest.split("."))] = f"--set {override}"
+        key = ("nodes", *prefix, *rest.split("."))
+        document.places[key] = f"--set {override}"
     else:
         raise ConfigError(
             f"--set {override}: no node called {head!r}; known are {', '.join(nodes)}, and params"

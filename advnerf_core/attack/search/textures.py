@@ -67,7 +67,8 @@ def pink(grid: ColourGrid, generator: torch.Generator) -> Tensor:
     amplitude /= amplitude.square().mean().sqrt()
     white = torch.randn((3, *grid.shape), generator=generator)
     noise = torch.fft.ifftn(torch.fft.fftn(white, dim=axes) * amplitude, dim=axes).real
-    return noise[(slice(None), *grid.cells.T)].T.contiguous()
+    at = (slice(None), *grid.cells.T)
+    return noise[at].T.contiguous()
 
 
 def natural(grid: ColourGrid, generator: torch.Generator) -> Tensor:
