@@ -107,7 +107,7 @@ def test_a_type_checker_knows_the_types_of_public_names_and_no_others(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600)
     assert 'mine.py:1: error: Module "advnerf_core" has no attribute "Pth"' in done.stdout
     assert '-> advnerf_core.attack.artifact.AttackFile"' in done.stdout
-    assert '(bag: pathlib.Path) -> nodes.bags.reader.BagInfo"' in done.stdout
+    assert '(bag: pathlib.Path) -> nodes.bags.info.BagInfo"' in done.stdout
 
 
 def test_public_names_can_be_looked_up_again_and_stay_the_same():

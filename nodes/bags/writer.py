@@ -26,6 +26,7 @@ from nodes.bags.part import PartWriter
 from nodes.bags.parts import METADATA_FILE, part_name
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
+from nodes.runtime.paths import require_new
 
 _SYNC_PERIOD_S = 1.0
 _BYTES_PER_MIB = 1 << 20
@@ -49,16 +50,6 @@ class SplitLimits:
             return False
         late = abs(log_ns - part.first_log_ns) >= self.duration_s * NS_PER_S
         return late or part.size_bytes >= self.size_mib * _BYTES_PER_MIB
-
-
-def require_new(folder: Path) -> None:
-    """Refuse a folder for a new bag that holds anything.
-
-    Raises:
-        BagError: It exists, and is not empty.
-    """
-    if folder.is_file() or (folder.exists() and any(folder.iterdir())):
-        raise BagError(f"{folder} exists and is not empty; record to another folder, or remove it")
 
 
 class BagWriter:

@@ -147,9 +147,9 @@ def bag_record(
     run_dir: RunDir = None,
 ) -> None:
     """Record the topics of a running launch until Ctrl-C."""
-    from nodes.bags.writer import require_new
     from nodes.launching.watching import find_run_dir, node_names
     from nodes.recorder import RecorderConfig, RecorderNode
+    from nodes.runtime.paths import require_new
     from nodes.runtime.process import run_node
 
     folder = output if output.name else Path(f"bag-{time.strftime('%Y%m%d-%H%M%S')}")

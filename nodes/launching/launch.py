@@ -25,7 +25,7 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.config import node_document
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.locks import HeldError, hold
-from nodes.runtime.paths import RESOLVED_NAME
+from nodes.runtime.paths import RESOLVED_NAME, require_new
 from nodes.runtime.topics import status_topic
 
 _POLL_S = 0.05
@@ -185,8 +185,6 @@ class Launch:
 
     def _require_new_bags(self) -> None:
         """Refuse a run folder with a bag of an earlier launch, before any node starts; the recorder would."""
-        from nodes.bags.writer import require_new
-
         for name, entry in self.plan.nodes.items():
             if entry.module == "nodes.recorder":
                 require_new(self.run_dir / self.plan.documents[name].data.get("output", "bag"))

@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 
 from advnerf_core.places import PlaceError, private_folder, temporary_folder, temporary_path
-from nodes.runtime.errors import BusError
+from nodes.runtime.errors import BagError, BusError
 
 # sizeof(sockaddr_un.sun_path) is 108 on Linux, including the final zero.
 UNIX_PATH_LIMIT = 107
@@ -108,3 +108,13 @@ def socket_path(run_dir: Path, topic: str) -> Path:
 def lock_path(socket: Path) -> Path:
     """Lock file next to a socket. A status publisher touches it at every status, so that the last status's age is known."""
     return socket.with_name(socket.name + ".lock")
+
+
+def require_new(folder: Path) -> None:
+    """Refuse a folder for a new bag that holds anything.
+
+    Raises:
+        BagError: It exists, and is not empty.
+    """
+    if folder.is_file() or (folder.exists() and any(folder.iterdir())):
+        raise BagError(f"{folder} exists and is not empty; record to another folder, or remove it")

@@ -10,6 +10,7 @@ import pytest
 
 from advnerf_core.attack.artifact import load_attack, save_attack
 from advnerf_core.attack.printing.poster import poster_of
+from advnerf_core.attack.printing.record import save_record
 from advnerf_core.data.image_files import write_image
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.fields.voxel_grid import face_corners_in_object
@@ -29,7 +30,7 @@ from calibration.print_pose import PrintPose
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
-from nodes.experiment.node.printed import write_record
+from nodes.experiment.node.printed import record_beside
 from nodes.experiment.node.search import run_attack
 from nodes.runtime.messages import encode, image_message, pose_message
 from nodes.runtime.progress import ProgressDisplay
@@ -143,7 +144,7 @@ def test_a_chart_beside_it_is_a_card(call, folder):
 @pytest.fixture
 def measuring(folder):
     """The words that measure a photograph of everything but the print."""
-    write_record(poster(folder), folder / "a.attack.safetensors", folder / "p.png", 50.0)
+    save_record(*record_beside(poster(folder), folder / "a.attack.safetensors", folder / "p.png", 50.0))
     noise = np.random.default_rng(0).integers(0, 256, (720, 960, 3)).astype(np.uint8)
     write_image(folder / "photo.png", noise)
     files = folder / "photo.png", "--print", folder / "p.print.json", "--camera", folder / "lens.yaml"

@@ -89,7 +89,7 @@ def test_a_png_and_a_page_of_the_posters_size(printed, tmp_path):
     ("arguments", "message"),
     [
         (["-o", "poster.jpg"], "expected a .pdf or .png file to write, got poster.jpg; correct --output"),
-        (["--marker-mm", 5], "should be greater than or equal to 8"),
+        (["--marker-mm", 5], "expected a value greater than or equal to 8, got '5'"),
         (["--margin-mm", 1], "expected a margin of 4 to 40 mm"),
         (["--object", "car"], "expected an object of face; got 'car'"),
         (["--object-size", 1], "whose attack file says 0.4 x 0.4 m"),

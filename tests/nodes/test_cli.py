@@ -333,3 +333,16 @@ def test_a_missing_extra_is_named_with_its_installation(monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main()
     assert "pip install 'advnerf[core]'" in capsys.readouterr().err
+
+
+def test_a_replay_overwrites_nothing_that_it_was_given(command, tmp_path):
+    bag, attack = tmp_path / "drive.mcap", tmp_path / "a.safetensors"
+    for file in (bag, attack):
+        file.write_text(file.name)
+    given = ("bag", "replay", bag, "--attack", attack)
+    for output in (("--json", attack), ("--plot", bag)):
+        code, _, errors = command(*given, *output)
+        assert (code, "would be overwritten" in errors) == (2, True), errors
+    code, _, errors = command("bag", "replay", bag, "--golden", bag, "--update-golden")
+    assert (code, "would be overwritten" in errors) == (2, True), errors
+    assert [file.read_text() for file in (bag, attack)] == [bag.name, attack.name]

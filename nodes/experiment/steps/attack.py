@@ -114,7 +114,7 @@ class Prepared:
             one, other = (problem.sense((tick,), states, theta) for theta in (found.theta, 1.0 - found.theta))
             if not torch.equal(one.images, other.images):
                 return
-        names = ", ".join(each.name for each in self.experiment.objects)
+        names = ", ".join(each.name for each in self.experiment.objects) or "the attacked face"
         raise ConfigError(
             f"expected {names} in view of the searched drives, got {len(rollout.states) - 1} ticks whose pictures do not depend on it; "
             "move it (x_m, y_m, z_m, yaw_rad, scale), or the starts"

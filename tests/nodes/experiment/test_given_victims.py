@@ -53,7 +53,7 @@ FILE: dict[str, Any] = {
     "victims": {"mine": {"policy": "my.onnx"}, "module": {"policy": "my_driver:factory"}},
     "carrier": {"kind": "overlay", "resolution": 8}, "space": {"kind": "colours", "cells": 8}, "measure": {"starts": 1},
     "capture": {"photos": 9, "held_out": 3, "colour_pairs": 3}, "attack": {"evaluations": 2}, "over": {"method": ["none", "random"]},
-    "scene": {"steps": 20, "log2_entries": 10, "finest": 32, "occupancy": 32, "interval_px": 32}, "settings": {"tiny": {}},
+    "scene": {"steps": 20, "log2_entries": 10, "finest": 64, "occupancy": 32, "interval_px": 32}, "settings": {"tiny": {}},
 }  # fmt: skip
 ONLY_THE_MODULE = ("victims={module: {policy: 'my_driver:factory'}}", "over.method=[none,random,gradient]")
 

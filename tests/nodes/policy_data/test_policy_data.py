@@ -54,13 +54,21 @@ def test_a_calibrated_camera_of_any_size_is_cropped_at_the_fraction_of_our_own(
 ):
     file = tmp_path / "camera.yaml"
     own = load_calibration(CameraCalibration, TWIN_CAMERA)
-    save_calibration(own.model_copy(update={"width": width, "height": height}), file)
+    intrinsics = {
+        "width": width,
+        "height": height,
+        "fx": width,
+        "fy": width,
+        "cx": 0.5 * width,
+        "cy": 0.5 * height,
+    }
+    save_calibration(own.model_copy(update=intrinsics), file)
     view = policy_view(file, [])
     image = np.zeros((height, width, 3), np.uint8)
     image[first:last] = 255  # rows 24 to 135 of 188
     assert view.image(image).min() == 255
     assert view.image(255 - image).max() == 0
-    assert (view.camera.fx, view.distortion) == (own.fx, own.distortion)
+    assert (view.camera.fx, view.distortion) == (width, own.distortion)
 
 
 def test_our_own_camera_is_cropped_as_ever():
