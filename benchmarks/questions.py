@@ -184,7 +184,7 @@ QUESTIONS = (
         "green",
         "Are tests and demo green on a slow or busy machine?",
         "Repeated runs, beside endless loops and on one core, and tests of whole kinds of faults.",
-        ("repeat_tests", "demo_against"),
+        ("repeat_tests", "demo_against", "tests_cost"),
     ),
     Question(
         "size",
