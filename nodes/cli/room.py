@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from advnerf_core.geometry import Array
     from calibration.path_fit import PathFit
-    from calibration.schema import RoomCalibration, measured
+    from calibration.schema import RoomCalibration
 
 app = typer.Typer(
     no_args_is_help=True, help="Measure path, fence and targets with motion capture; place board and monitor."
@@ -53,7 +53,7 @@ def room_path(
     from calibration.path_fit import fit_path
     from calibration.plots import save_with_plot
     from calibration.room import clearance, fence_around, start_before_corner
-    from calibration.schema import RoomCalibration
+    from calibration.schema import RoomCalibration, measured
 
     trace = _trace(bag, topic)
     fit = fit_path(trace, closed)
