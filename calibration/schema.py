@@ -27,10 +27,10 @@ Row4 = tuple[float, float, float, float]
 Point3 = tuple[float, float, float]
 Point2 = tuple[float, float]
 # Bounds that only another unit exceeds: no car, lens or test track comes near them.
-_Length = Annotated[float, at_most(20.0, "m", "cm or mm")]
+LengthM = Annotated[float, at_most(20.0, "m", "cm or mm")]
 _Delay = Annotated[float, at_most(5.0, "s", "ms")]
-_Speed = Annotated[float, at_most(50.0, "m/s", "km/h or mm/s")]
-_WheelAngle = Annotated[float, at_most(0.5 * math.pi, "rad", "degrees")]
+SpeedMps = Annotated[float, at_most(50.0, "m/s", "km/h or mm/s")]
+RightAngleRad = Annotated[float, at_most(0.5 * math.pi, "rad", "degrees")]
 _AngularRate = Annotated[float, at_most(100.0, "rad/s", "degrees/s")]
 _RIGID_TOLERANCE = 1e-6
 _PLANAR_TOLERANCE_M = 0.005
@@ -149,10 +149,10 @@ class GainsSection(StrictModel):
 class LimitsSection(StrictModel):
     """See `hardware.motor.limits.DriveLimits`."""
 
-    speed_min_mps: _Speed
-    speed_max_mps: _Speed
-    steering_min_rad: _WheelAngle
-    steering_max_rad: _WheelAngle
+    speed_min_mps: SpeedMps
+    speed_max_mps: SpeedMps
+    steering_min_rad: RightAngleRad
+    steering_max_rad: RightAngleRad
     acceleration_mps2: Annotated[float, at_most(100.0, "m/s^2", "cm/s^2")]
     steering_rate_radps: _AngularRate
     current_max_a: Annotated[float, at_most(1000.0, "A", "mA")] = Field(default=60.0, gt=0.0)
@@ -201,7 +201,7 @@ class VehicleCalibration(Calibration):
     """
 
     kind: Literal["vehicle"] = "vehicle"
-    wheelbase_m: _Length = Field(gt=0.0)
+    wheelbase_m: LengthM = Field(gt=0.0)
     gains: GainsSection
     limits: LimitsSection
     response: ResponseSection | None = None
@@ -271,7 +271,7 @@ class RoomCalibration(Calibration):
 
     kind: Literal["room"] = "room"
     path: dict[str, Any]
-    off_track_m: _Length = Field(gt=0.0)
+    off_track_m: LengthM = Field(gt=0.0)
     fence_m: tuple[Point2, ...] = Field(min_length=3)
     start_pose: tuple[float, float, Angle]
 

@@ -94,7 +94,7 @@ class Objective:
 
     def value(self, drives: JudgedDrives) -> Tensor:
         """Success of the attacker in each drive, ``[B]``; higher is a stronger attack."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no value(); implement it")
 
     def loss(self, drives: JudgedDrives) -> Tensor:
         """Loss of each drive, ``[B]``, differentiable in ``drives.states``; minus the value unless it is overridden."""

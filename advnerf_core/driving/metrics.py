@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,11 +101,12 @@ def metrics_of_drives(
     path: Path,
     drives: Sequence[ArrayLike],
     horizon: Horizon | None = None,
-    stopped_ticks: Sequence[int | None] = (),
+    stopped_ticks: Sequence[int | None] | None = None,
 ) -> list[DriveMetrics]:
-    """`drive_metrics` of drives along one path, whose positions are projected together; ``stopped_ticks`` is one for each drive, or none."""
+    """`drive_metrics` of drives along one path, whose positions are projected together; ``stopped_ticks`` has one for each drive."""
     limits, positions = horizon or Horizon(), []
-    for states, stopped_tick in zip_longest(drives, stopped_ticks):
+    stopped = [None] * len(drives) if stopped_ticks is None else stopped_ticks
+    for states, stopped_tick in zip(drives, stopped, strict=True):
         xy = np.asarray(states, dtype=np.float64)
         if xy.ndim != 2 or xy.shape[0] < 2 or xy.shape[1] < 2 or not np.isfinite(xy).all():
             raise ValueError(

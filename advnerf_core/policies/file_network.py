@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ from advnerf_core.policies.memory import initial_memory, joined, split
 from advnerf_core.policies.tensors import Tensors
 
 
-class FileNetwork:
+class FileNetwork(ABC):
     """Base of the networks of policy files; a subclass runs the file.
 
     Args:
@@ -23,13 +24,13 @@ class FileNetwork:
     def __init__(self, tensors: Tensors) -> None:
         self.tensors = tensors
 
+    @abstractmethod
     def run(self, feeds: Mapping[str, Any], outputs: list[str]) -> list[Any]:
         """Compute outputs by name from inputs by name, which are floating-point arrays of any type.
 
         Raises:
             Exception: The inputs do not fit the file.
         """
-        raise NotImplementedError
 
     def initial_memory(self, batch: int) -> Any:
         """Memory ``[B, K]`` before the first image, of a file with states."""

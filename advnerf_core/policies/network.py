@@ -72,7 +72,7 @@ class SteeringNetwork(nn.Module):
             images: ``[B, 3, 66, 200]`` RGB in 0..1, float32 or float64 like the weights.
             goals: ``[B, goal_size]`` in the type of the images; None if ``goal_size`` is 0.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no output(); implement it")
 
     def forward(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
         """Steering ``[B]`` [rad], left positive, within ``+-max_steering_rad``.

@@ -52,9 +52,8 @@ LEGEND = (
 )
 
 
-Clips = Mapping[
-    str, Mapping[str, CellResult]
-]  # cells by outcome and by the clip's file, relative to the page
+# Cells by outcome and by the clip's file, relative to the page.
+Clips = Mapping[str, Mapping[str, CellResult]]
 
 
 def outcome_of(cell: CellResult) -> str:

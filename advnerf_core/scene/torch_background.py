@@ -6,6 +6,7 @@ together and composited; rays that have ended drop out. Sums along a ray have a 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -38,7 +39,7 @@ class _Rays(NamedTuple):
     scale: Tensor
 
 
-class _TorchBackground:
+class _TorchBackground(ABC):
     """A background renderer on a device.
 
     Args:
@@ -73,8 +74,9 @@ class _TorchBackground:
         rgb, depth_m, alpha = (torch.cat(each) for each in zip(*parts, strict=True))
         return rgb.view(*shape, 3), depth_m.view(shape), alpha.view(shape)
 
+    @abstractmethod
     def _shown(self, rays: _Rays) -> tuple[Tensor, Tensor, Tensor]:
-        raise NotImplementedError
+        """Colour, depth and alpha of rays."""
 
     def _there(self, array: NDArray[Any]) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)

@@ -191,7 +191,7 @@ def _cheap_problems(plan: Any) -> list[str]:
     from nodes.lab.doctor.launch import missing_policies
     from nodes.launching.launch_check import check_nodes
 
-    return list(check_nodes(plan).values()) or missing_policies(plan) or files.problems(plan)[0]
+    return list(check_nodes(plan).values()) or missing_policies(plan) or files.unusable(plan)
 
 
 def _problems(plan: Any) -> list[str]:
@@ -199,7 +199,7 @@ def _problems(plan: Any) -> list[str]:
     from nodes.lab.doctor import files
     from nodes.lab.doctor.launch import policy_problems
 
-    return _cheap_problems(plan) or files.problems(plan)[1] or policy_problems(plan)
+    return _cheap_problems(plan) or files.missing(plan) or policy_problems(plan)
 
 
 def _refuse(problems: Sequence[str]) -> None:

@@ -93,7 +93,8 @@ def scene_eval(
     from nodes.lab.scene_training import evaluate
 
     renderer = load_renderer(scene, interval_scale)
-    _print_figures(evaluate(renderer, load_transforms(transforms).training_and_held_out(every)[1], size))
+    held_out = load_transforms(transforms).training_and_held_out(every)[1]
+    _print_figures(evaluate(renderer, held_out, held_out.load(size)))
 
 
 @app.command("render")

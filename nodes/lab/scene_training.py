@@ -52,7 +52,9 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     for remark in training.remarks:
         print(remark)
     images = training.load(request.size)
-    held_out.load(request.size)  # an image that cannot be compared afterwards is an error now
+    compared = held_out.load(
+        request.size
+    )  # now, so that an image that cannot be compared is an error at once
     field = scene_field(request, training, images)
     march = sample_intervals(request, field, images)
     print(_described(request, field, march))
@@ -81,19 +83,21 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
             {"image": name, "gain": gain.tolist()} for name, gain in zip(names, trained.gains, strict=True)
         ]
         write_json(request.output / EXPOSURE, rows)
-    figures = evaluate(FieldRenderer.from_file(request.output / SCENE), held_out, request.size)
+    figures = evaluate(FieldRenderer.from_file(request.output / SCENE), held_out, compared)
     write_json(request.output / FIGURES, figures)
     return figures
 
 
-def evaluate(
-    renderer: FieldRenderer | SplatRenderer, listed: PosedImages, size: tuple[int, int] | None
-) -> dict[str, Any]:
+def evaluate(renderer: FieldRenderer | SplatRenderer, listed: PosedImages, views: ImageSet) -> dict[str, Any]:
     """Compare with held-out images: PSNR [dB], PSNR after a gain fitted to each image [dB], and SSIM.
+
+    Args:
+        renderer: The scene.
+        listed: The images' list, for their names.
+        views: The same images, loaded.
 
     Masked pixels are excluded from both PSNR.
     """
-    views = listed.load(size)
     # Images with alpha are compared over white, which the renderer uses too.
     rows = [
         {"image": listed.frames[index].path.name, **_compared(renderer, views, index, real)}

@@ -31,12 +31,12 @@ from nodes.experiment.plan.sections import ResponseConfig
 from nodes.experiment.show.experiment_world import ExperimentWorld
 from nodes.experiment.show.given import given_in, given_victim
 from nodes.lab.policy_camera import require_camera
-from nodes.lab.policy_data.frames import view_for_camera
+from nodes.lab.policy_data.frames import OWN_VIEW, view_for_camera
 from nodes.lab.worlds.expert_drive import as_path, expert_of
 from nodes.runtime.errors import ConfigError
 
-# The default view fits a driving camera of this size [px]; one that differs by more than the factor needs a view of its own.
-_USUAL, _OTHER_SIZE = (336, 188), 1.25
+# A driving camera whose size differs from the default view's by more than this factor needs a view of its own.
+_OTHER_SIZE = 1.25
 PLACED, CALIBRATION = "objects.json", "calibration"
 # Distances in stages were chosen for half a lane of this width [m] and for this speed [m/s]: the simulated junction's.
 _HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
@@ -192,15 +192,14 @@ class Experiment(ExperimentWorld):
             ) from error
 
     def _require_usual_size(self) -> None:
-        size = (self.camera.width, self.camera.height)
-        if all(
-            1 / _OTHER_SIZE < px / usual_px < _OTHER_SIZE for px, usual_px in zip(size, _USUAL, strict=True)
-        ):
+        usual = OWN_VIEW.camera
+        sizes = ((self.camera.width, usual.width), (self.camera.height, usual.height))
+        if all(1 / _OTHER_SIZE < px / usual_px < _OTHER_SIZE for px, usual_px in sizes):
             return
         alike = view_for_camera(self.camera)
         raise ConfigError(
-            f"{self.file}: expected a section view for a driving camera of {size[0]} x {size[1]}, because the default window fits "
-            f"{_USUAL[0]} x {_USUAL[1]}; the same part of the image is 'view: {{crop_top_px: {alike.crop_top_px}, "
+            f"{self.file}: expected a section view for a driving camera of {self.camera.width} x {self.camera.height}, because the default window fits "
+            f"{usual.width} x {usual.height}; the same part of the image is 'view: {{crop_top_px: {alike.crop_top_px}, "
             f"crop_height_px: {alike.crop_height_px}}}'"
         )
 

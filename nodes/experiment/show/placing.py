@@ -54,7 +54,9 @@ def place_by_rule(experiment: Experiment, world: World) -> list[PlacedObject]:
             found.append(wanted)
             continue
         name = wanted.stands.path or experiment.config.paths[0]
-        seen = views.get(name) or views.setdefault(name, list(_views(experiment, world, name)))
+        if name not in views:
+            views[name] = list(_views(experiment, world, name))
+        seen = views[name]
         fitting = (
             spot
             for spot in _spots(experiment, wanted, name)

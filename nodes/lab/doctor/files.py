@@ -76,13 +76,22 @@ def named(plan: Plan) -> list[CheckResult]:
     return rows or report("files", OK, "all files that the nodes name exist")
 
 
-def problems(plan: Plan) -> tuple[list[str], list[str]]:
-    """Return the errors of calibrations and attacks, without which no node starts, and those of all other files, as one line each."""
-    found: tuple[list[str], list[str]] = [], []
-    for row in (*calibrations(plan), *named(plan)):
-        if row.state == FAILURE:
-            found[row.check == "files"].append(" ".join(f"{row.found}; {row.do}".split()))
-    return found
+def unusable(plan: Plan) -> list[str]:
+    """The errors of calibrations and attacks, without which no node starts, as one line each."""
+    return [
+        _line(row)
+        for row in (*calibrations(plan), *named(plan))
+        if row.state == FAILURE and row.check != "files"
+    ]
+
+
+def missing(plan: Plan) -> list[str]:
+    """All other files that the nodes name and that do not exist, as one line each."""
+    return [_line(row) for row in named(plan) if row.state == FAILURE and row.check == "files"]
+
+
+def _line(row: CheckResult) -> str:
+    return " ".join(f"{row.found}; {row.do}".split())
 
 
 def _paths(value: Any) -> Iterator[str]:

@@ -97,7 +97,7 @@ def held_out(recording: RecordedFrames) -> np.ndarray[Any, np.dtype[np.int64]]:
 
 def view_for_camera(camera: Pinhole, distortion: tuple[float, ...] = ()) -> PolicyView:
     """View of a camera, with the same crop fraction as for advnerf's camera."""
-    return _cropped_alike(_OWN_VIEW, camera, distortion)
+    return _cropped_alike(OWN_VIEW, camera, distortion)
 
 
 def view_for_size(width: int, height: int) -> PolicyView:
@@ -117,7 +117,7 @@ def _guessed_camera(width: int, height: int) -> Pinhole:
     return Pinhole(width, height, 0.52 * width, 0.52 * width, 0.5 * width, 0.5 * height)
 
 
-_OWN_VIEW = PolicyView(_guessed_camera(336, 188))
+OWN_VIEW = PolicyView(_guessed_camera(336, 188))
 
 
 def _cropped_alike(view: PolicyView, camera: Pinhole, distortion: tuple[float, ...] = ()) -> PolicyView:

@@ -234,8 +234,11 @@ def test_an_open_path_from_a_file(tmp_path: Path) -> None:
         ({"path": "images_of_mine/transforms.json", "camera": {"z_m": 0}}, "camera.z_m"),
         ({"path": "images_of_mine/images/00000.png"}, "expected ground_z_m and camera.pitch_down_rad"),
         ({"car": {}}, "car.speed_mps is missing"),
-        ({"camera": {"z_m": 200}}, "camera.z_m: input should be less than or equal to 20, got 200"),
-        ({"camera": {"z_m": 0.2, "pitch_down_rad": 10}}, "camera.pitch_down_rad: input should be less than"),
+        ({"camera": {"z_m": 200}}, "camera.z_m: expected at most 20 m, not cm or mm, got 200"),
+        (
+            {"camera": {"z_m": 0.2, "pitch_down_rad": 10}},
+            "camera.pitch_down_rad: expected at most 1.5708 rad, not degrees",
+        ),
     ],
 )
 def test_what_is_missing_is_said(tmp_path: Path, changes: dict[str, object], message: str) -> None:

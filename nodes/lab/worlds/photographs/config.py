@@ -12,16 +12,12 @@ from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import PosedImages
 from advnerf_core.geometry import Pinhole
 from advnerf_core.strict import StrictModel
+from calibration.schema import LengthM, RightAngleRad, SpeedMps
 from hardware.worlds.world import CarDescription
 from nodes.lab.located import content_sha256, located
 
 DRIVEN = "driven"
 AboveZero = Annotated[float, Field(gt=0.0)]
-# Beyond any car: what is more was written in mm, degrees or km/h.
-SpeedMps = Annotated[float, Field(gt=0.0, le=100.0)]
-CarLengthM = Annotated[float, Field(gt=0.0, le=20.0)]
-PlaceOnCarM = Annotated[float, Field(ge=-20.0, le=20.0)]
-Pitch = Annotated[float, Field(ge=-1.6, le=1.6)]
 
 
 def _located(name: str, info: ValidationInfo) -> str:
@@ -40,8 +36,8 @@ class DrivenCarConfig(StrictModel):
         max_steering_rad: Largest angle of the front wheels to either side [rad]; without a wheelbase, largest turn rate [rad/s].
     """
 
-    speed_mps: SpeedMps
-    wheelbase_m: CarLengthM | None
+    speed_mps: SpeedMps = Field(gt=0.0)
+    wheelbase_m: Annotated[LengthM, Field(gt=0.0)] | None
     max_steering_rad: AboveZero
 
     @model_validator(mode="after")
@@ -69,10 +65,10 @@ class MountedCameraConfig(StrictModel):
         pinhole: Intrinsics of the camera; None: the photographs', undistorted.
     """
 
-    x_m: PlaceOnCarM = 0.0
-    y_m: PlaceOnCarM = 0.0
-    z_m: CarLengthM
-    pitch_down_rad: Pitch | None = None
+    x_m: LengthM = 0.0
+    y_m: LengthM = 0.0
+    z_m: LengthM = Field(gt=0.0)
+    pitch_down_rad: RightAngleRad | None = None
     pinhole: Pinhole | None = None
 
 
