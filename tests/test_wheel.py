@@ -203,10 +203,7 @@ def test_the_commands_work_for_a_user_without_a_home_among_files_of_strange_name
     assert "failure" not in states.values()
     if os.getuid() == 0:
         assert (states["home"], states["cache"]) == ("warning", "warning")
-    assert (
-        "46 files copied" in advnerf("experiment", "init", "x").stdout
-        or "files copied to x" in advnerf("init", "y").stdout
-    )
+    assert "files copied to x" in advnerf("experiment", "init", "x").stdout
     policy = advnerf.packages / "nodes" / "shipped" / POLICY
     plan = advnerf("launch", "green_screen", "--check", "--set", f"params.policy={policy}")
     assert "nodes.safety" in plan.stdout

@@ -75,7 +75,7 @@ def test_a_stalled_link_stops_the_car():
     circle = (
         "policy.module=tests.support.live.straight_policy",
         "policy.speed_mps=0.8",
-        "policy.steering_rad=0.2",
+        "policy.steering_rad=0.08",  # 7 m between the island and the walls
     )
     result = two_hosts.measure("stall", two_hosts.POLICY, circle)
     assert result["met"], result

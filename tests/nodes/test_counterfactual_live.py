@@ -1,6 +1,6 @@
 """Counterfactual steering as it is recorded: the green screen's graph on the twin, one process per node, one drive past an attack."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +92,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
     def drive() -> dict[str, Any]:
         launch = ROOT / "launch" / "green_screen.launch.yaml"
-        return run_trial(launch, overrides, folder / "drive", plan, 120.0).to_dict()
+        return asdict(run_trial(launch, overrides, folder / "drive", plan, 120.0))
 
     outcome = drive_with_tries(drive, folder / "drive.json", print)
     outcome.pop("spoiled")

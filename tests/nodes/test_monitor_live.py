@@ -1,5 +1,6 @@
 """The monitor attack as real processes on the twin: the attack reaches the lab's camera only while the car is armed."""
 
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -34,7 +35,7 @@ def test_the_lab_camera_sees_the_attack_while_armed_and_not_before(tmp_path):
     start = (1.95, -0.5, 0.5 * np.pi)
     launch, plan = ROOT / "launch" / "monitor.launch.yaml", TrialPlan(start, 1.5, NODES)
     drive = drive_with_tries(
-        lambda: run_trial(launch, overrides, tmp_path / "run", plan, 60.0).to_dict(),
+        lambda: asdict(run_trial(launch, overrides, tmp_path / "run", plan, 60.0)),
         tmp_path / "run.json",
         print,
     )

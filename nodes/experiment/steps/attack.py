@@ -117,7 +117,7 @@ class Prepared:
         names = ", ".join(each.name for each in self.experiment.objects) or "the attacked face"
         raise ConfigError(
             f"expected {names} in view of the searched drives, got {len(rollout.states) - 1} ticks whose pictures do not depend on it; "
-            "move it (x_m, y_m, z_m, yaw_rad, scale), or the starts"
+            "move it (x_m, y_m, z_m, yaw_rad, scale), or the starts; if it stands in view, the scene hides it: take more photographs, or let it learn longer"
         )
 
 

@@ -90,7 +90,8 @@ def test_fitting_brings_the_picture_nearer_to_the_mesh():
     before = build_from_mesh(mesh, "hydrant", resolution=24, steps=0)
     after = build_from_mesh(mesh, "hydrant", resolution=24, steps=40)
     held_out = mesh_views(mesh, 4, 96, phase=0.2)
-    assert Agreement.of(after, held_out).psnr_db > Agreement.of(before, held_out).psnr_db + 2.0
+    # Of the object's own pixels: the background, which both leave empty, would dampen what the fit changes.
+    assert Agreement.of(after, held_out).object_psnr_db > Agreement.of(before, held_out).object_psnr_db + 2.0
     assert after.about["held_out_psnr_db"] > 20.0
     np.testing.assert_allclose(after.size_m, mesh.size_m, atol=3 * after.grids.voxel)
 

@@ -17,8 +17,8 @@ from nodes.runtime.errors import ConfigError
 
 TINY = {
     "gate": None,
-    "capture": {"photos": 6, "held_out": 3},
-    "scene": {"steps": 4, "log2_entries": 10, "finest": 32, "occupancy": 16},
+    "capture": {"photos": 40, "held_out": 3},
+    "scene": {"steps": 60, "log2_entries": 10, "finest": 32, "occupancy": 16},
     "object": {"car_resolution": 12, "hydrant_resolution": 10, "fit_steps": 0},
     "policy": {
         "deployed_stills": 2, "surrogate_stills": 2, "deployed_drives": 1, "surrogate_drives": 1, "drive_steps": 2, "dagger_rounds": 1,
@@ -53,13 +53,13 @@ def test_every_stage_runs_against_a_server_and_leaves_it_as_it_was(as_carla, fil
     kept = json.loads((run / "capture" / "world.json").read_text())["description"]
     assert kept["off_track_m"] == experiment.world.off_track_m == pytest.approx(1.75)
     assert kept["facts"]["junction_id"] == 100
-    assert len(load_transforms(run / "capture" / "photos", require_all=True).frames) == 6
+    assert len(load_transforms(run / "capture" / "photos", require_all=True).frames) == 40
     cell = json.loads((run / "cells" / "right_hardened_gradient_0.json").read_text())
-    driven = np.array(
-        json.loads((run / "cells" / "right_hardened_gradient_0" / "drives.json").read_text())["states"][0]
-    )
-    cte_m = experiment.paths["right"].project(driven[1:, :2]).cte_m
-    assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(cte_m).sum()])
+    drives = json.loads((run / "cells" / "right_hardened_gradient_0" / "drives.json").read_text())["states"]
+    path = experiment.paths["right"]
+    totals_m = [np.abs(path.project(np.array(driven)[1:, :2]).cte_m).sum() for driven in drives]
+    assert cell["deployed"]["total_cte_m"] == pytest.approx(totals_m)
+    assert len(totals_m) == experiment.config.measure.starts
     assert len(read_clip(run / "report" / "right.mp4")) == 4  # three ticks and the start
     assert "the world carla" in (run / "report" / "report.html").read_text()
     assert not as_carla.world.get_settings().synchronous_mode

@@ -111,7 +111,7 @@ def test_the_car_is_asked_for_what_its_launch_file_wants(car, tmp_path, monkeypa
     rows = findings(plan_of("robot", *overrides), tmp_path)
     assert states(rows, "VESC") == [OK]
     (timeout,) = [row for row in rows if row.check == "VESC time-out"]
-    assert (timeout.state, "1000 ms with 0 A, at most 250 ms with 20 A wanted" in timeout.found) == (
+    assert (timeout.state, "1000 ms with 0 A; required is at most 250 ms with 20 A" in timeout.found) == (
         FAILURE,
         True,
     )

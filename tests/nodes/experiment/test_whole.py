@@ -24,7 +24,7 @@ from nodes.launching.child import Child
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 SMALL = [
-    "capture.photos=24", "capture.colour_pairs=2", "capture.held_out=3", "scene.steps=60",
+    "capture.photos=80", "capture.colour_pairs=2", "capture.held_out=3", "scene.steps=150",
     "policy.deployed_stills=12", "policy.surrogate_stills=8", "policy.deployed_drives=2", "policy.surrogate_drives=2",
     "policy.drive_steps=4", "policy.first_steps=8", "policy.round_steps=4", "policy.naive_steps=0",
     "gate=null", "attack.horizon=8", "attack.evaluations=2", "carrier.resolution=8",
