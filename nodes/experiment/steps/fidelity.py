@@ -7,6 +7,7 @@ calibration predicts for the camera. No drive with the attack is used.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -142,17 +143,22 @@ def loop(
 
 
 def _measured_car(experiment: Experiment, clean: Path) -> RespondingCar:
-    """The deployed car with the response of its drives without attack; the search's own car if that one drives."""
-    ideal = experiment.dynamics
-    if experiment.config.deploy.car == "ideal" or not (clean / DRIVES).exists():
+    """The deployed car with the response of its drives without attack; the search's own car if that one drives, or if they were live."""
+    ideal, kept = experiment.dynamics, clean / DRIVES
+    # Commands of live drives are in their bags, each with a delay of its own.
+    if experiment.config.deploy.car == "ideal" or experiment.config.deploy.live or not kept.exists():
         return RespondingCar(ideal, CarResponse(ideal.speed_mps))
-    kept = read_json(clean / DRIVES)
+    return RespondingCar(ideal, fit_response(*_until_blocked(read_json(kept)), ideal))
+
+
+def _until_blocked(kept: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
+    """Poses ``[T + 1, 3]`` and commands ``[T]`` of each kept drive, until it stood against something."""
     ends = [
         tick or len(commands) for tick, commands in zip(kept["blocked_tick"], kept["commands"], strict=True)
     ]
     poses = [np.array(each)[: end + 1] for each, end in zip(kept["states"], ends, strict=True)]
     controls = [np.array(each)[:end] for each, end in zip(kept["commands"], ends, strict=True)]
-    return RespondingCar(ideal, fit_response(poses, controls, ideal))
+    return poses, controls
 
 
 def _found(experiment: Experiment, cell: Cell, folder: Path) -> tuple[Space, AttackFile]:
