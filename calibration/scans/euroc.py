@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.csv_rows import read_csv
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.scan_folder import euroc_root
-from advnerf_core.documents import parse_yaml, read_csv, read_text
+from advnerf_core.documents import parse_yaml, read_text
 from advnerf_core.geometry import Array, Pinhole, invert_transform
 from calibration.photo_model import LeftOut, Registered
 from calibration.scans.scan import (

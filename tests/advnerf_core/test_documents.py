@@ -6,15 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from advnerf_core.documents import (
-    dump_yaml,
-    parse_json,
-    parse_yaml,
-    read_csv,
-    read_json,
-    read_text,
-    read_yaml,
-)
+from advnerf_core.csv_rows import read_csv
+from advnerf_core.documents import dump_yaml, parse_json, parse_yaml, read_json, read_text, read_yaml
 from advnerf_core.errors import ConfigError
 
 BOM = b"\xef\xbb\xbf"

@@ -12,11 +12,12 @@ from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
+from advnerf_core.csv_rows import CsvRow, read_csv
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.logs.choice import LogChoice, LogError
 from advnerf_core.data.logs.drive_log import DriveLog, LogFrame, SteeringUnit
-from advnerf_core.documents import CsvRow, raise_problems, read_csv
+from advnerf_core.documents import raise_problems
 from advnerf_core.errors import ConfigError
 
 UDACITY_FILE = "driving_log.csv"

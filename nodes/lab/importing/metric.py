@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.csv_rows import read_csv
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.lens import straightening
 from advnerf_core.data.similarity import Similarity
-from advnerf_core.documents import read_csv
 from advnerf_core.errors import ConfigError
 from advnerf_core.geometry import Array
 from calibration.known_scale import View, fit_known_positions, length_scale, marker_scale

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.csv_rows import read_csv
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.similarity import rotation_angles
-from advnerf_core.documents import read_csv
 from advnerf_core.errors import ConfigError, MissingFileError
 from advnerf_core.geometry import Array, interpolate_transform, make_transform
 from calibration.camera_to_car import MountView
