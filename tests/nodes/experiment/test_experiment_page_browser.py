@@ -17,7 +17,7 @@ pytestmark = [
 DESK = {"viewport": {"width": 1400, "height": 900}, "color_scheme": "dark"}
 # Stages of seconds, and steps enough that the page sees them run.
 TINY = [
-    "capture.photos=12",
+    "capture.photos=80",  # with fewer, fog hides the face
     "capture.colour_pairs=2",
     "capture.held_out=3",
     "scene.steps=150",
