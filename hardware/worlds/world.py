@@ -67,6 +67,18 @@ class CarDescription(PlainData):
             raise WorldError(
                 f"expected wheelbase_m > 0 for an ackermann car, and none for a dubins car; got {self}"
             )
+        self._require_units()
+
+    def _require_units(self) -> None:
+        """Raise for numbers that no car has, and that a car has in other units."""
+        most_control = 0.5 * np.pi if self.kind == "ackermann" else 20.0
+        for name, value, most, unit, mistaken in (
+            ("speed_mps", self.speed_mps, 50.0, "m/s", "km/h or mm/s"),
+            ("wheelbase_m", self.wheelbase_m or 0.0, 20.0, "m", "cm or mm"),
+            ("control_limits", self.largest_control, most_control, self.control_unit, "degrees"),
+        ):
+            if value > most:
+                raise WorldError(f"{name}: expected at most {most:.5g} {unit}, not {mistaken}; got {value:g}")
 
     @property
     def largest_control(self) -> float:

@@ -96,6 +96,26 @@ def test_cars_and_boxes_that_cannot_be_are_refused(make: Any) -> None:
 
 
 @pytest.mark.parametrize(
+    ("car", "told"),
+    [
+        (
+            ("ackermann", 80.0, (-0.4, 0.4), 0.3),
+            "speed_mps: expected at most 50 m/s, not km/h or mm/s; got 80",
+        ),
+        (("ackermann", 1.0, (-0.4, 0.4), 300.0), "wheelbase_m: expected at most 20 m, not cm or mm; got 300"),
+        (
+            ("ackermann", 1.0, (-23.0, 23.0), 0.3),
+            "control_limits: expected at most 1.5708 rad, not degrees; got 23",
+        ),
+        (("dubins", 1.0, (-70.0, 70.0)), "control_limits: expected at most 20 rad/s, not degrees; got 70"),
+    ],
+)
+def test_a_car_in_other_units_is_refused(car: Any, told: str) -> None:
+    with pytest.raises(WorldError, match=f"^{told}$"):
+        CarDescription(*car)
+
+
+@pytest.mark.parametrize(
     "data",
     [
         {},
