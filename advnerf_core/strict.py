@@ -143,6 +143,13 @@ def within_a_turn(angle_rad: float) -> float:
 Angle = Annotated[float, AfterValidator(within_a_turn)]
 """An angle [rad]; degrees are refused where they are more than a turn."""
 
+# Bounds that only another unit exceeds: no car, lens or test track comes near them.
+LengthM = Annotated[float, at_most(20.0, "m", "cm or mm")]
+SpeedMps = Annotated[float, at_most(50.0, "m/s", "km/h or mm/s")]
+RightAngleRad = Annotated[float, at_most(0.5 * math.pi, "rad", "degrees")]
+AngularRate = Annotated[float, at_most(100.0, "rad/s", "degrees/s")]
+LagS = Annotated[float, at_most(5.0, "s", "ms")]
+
 
 def validate(model: type[M], document: Document, folder: Path | None = None) -> M:
     """Typed object of a document; all its unknown and invalid keys are one `ConfigError` with a line for each problem.

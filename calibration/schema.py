@@ -7,7 +7,6 @@ are in metres, angles in radians, transforms ``T_a_from_b`` as four rows.
 from __future__ import annotations
 
 import datetime
-import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -19,19 +18,24 @@ from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.errors import AdvnerfError, ConfigError, MissingFileError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole, require_camera
-from advnerf_core.strict import Angle, StrictModel, at_most, validate, within_a_turn
+from advnerf_core.strict import (
+    Angle,
+    AngularRate,
+    LagS,
+    LengthM,
+    RightAngleRad,
+    SpeedMps,
+    StrictModel,
+    at_most,
+    validate,
+    within_a_turn,
+)
 from calibration.fence import inside, require_simple
 from hardware.motor.limits import DriveLimits, VehicleGains
 
 Row4 = tuple[float, float, float, float]
 Point3 = tuple[float, float, float]
 Point2 = tuple[float, float]
-# Bounds that only another unit exceeds: no car, lens or test track comes near them.
-LengthM = Annotated[float, at_most(20.0, "m", "cm or mm")]
-_Delay = Annotated[float, at_most(5.0, "s", "ms")]
-SpeedMps = Annotated[float, at_most(50.0, "m/s", "km/h or mm/s")]
-RightAngleRad = Annotated[float, at_most(0.5 * math.pi, "rad", "degrees")]
-_AngularRate = Annotated[float, at_most(100.0, "rad/s", "degrees/s")]
 _RIGID_TOLERANCE = 1e-6
 _PLANAR_TOLERANCE_M = 0.005
 _LARGEST_MOUNT_M, _LARGEST_FACE_M = 20.0, 50.0
@@ -118,7 +122,7 @@ class CameraCalibration(Intrinsics):
 
     kind: Literal["camera"] = "camera"
     T_car_from_camera: tuple[Row4, Row4, Row4, Row4]
-    latency_s: _Delay = 0.0
+    latency_s: LagS = 0.0
 
     @field_validator("T_car_from_camera")
     @classmethod
@@ -154,7 +158,7 @@ class LimitsSection(StrictModel):
     steering_min_rad: RightAngleRad
     steering_max_rad: RightAngleRad
     acceleration_mps2: Annotated[float, at_most(100.0, "m/s^2", "cm/s^2")]
-    steering_rate_radps: _AngularRate
+    steering_rate_radps: AngularRate
     current_max_a: Annotated[float, at_most(1000.0, "A", "mA")] = Field(default=60.0, gt=0.0)
 
 
@@ -170,12 +174,12 @@ class ResponseSection(StrictModel):
         speed_lag_s: Time constant of the speed [s].
     """
 
-    pipeline_delay_s: _Delay = Field(ge=0.0)
-    steering_delay_s: _Delay = Field(ge=0.0)
-    steering_lag_s: _Delay = Field(ge=0.0)
-    steering_slew_radps: _AngularRate | None = Field(default=None, gt=0.0)
-    speed_delay_s: _Delay = Field(ge=0.0)
-    speed_lag_s: _Delay = Field(ge=0.0)
+    pipeline_delay_s: LagS = Field(ge=0.0)
+    steering_delay_s: LagS = Field(ge=0.0)
+    steering_lag_s: LagS = Field(ge=0.0)
+    steering_slew_radps: AngularRate | None = Field(default=None, gt=0.0)
+    speed_delay_s: LagS = Field(ge=0.0)
+    speed_lag_s: LagS = Field(ge=0.0)
 
     def attack_dynamics(self) -> dict[str, float]:
         """The section ``dynamics`` of an attack request: delay from image to wheels, lag and, if known, slew."""

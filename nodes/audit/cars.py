@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field
 
 from advnerf_core.plugins import unknown
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import LengthM, StrictModel
 from nodes.lab.worlds.photographs.config import DrivenCarConfig
 from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
@@ -24,9 +24,9 @@ class AuditedCar(StrictModel):
     """
 
     car: DrivenCarConfig
-    camera_ahead_m: float = 0.0
-    camera_left_m: float = 0.0
-    camera_height_m: float | None = Field(default=None, gt=0.0)
+    camera_ahead_m: LengthM = 0.0
+    camera_left_m: LengthM = 0.0
+    camera_height_m: LengthM | None = Field(default=None, gt=0.0)
 
 
 def _car(speed_mps: float, wheelbase_m: float | None, largest_rad: float, ahead_m: float) -> AuditedCar:

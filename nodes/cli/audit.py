@@ -71,11 +71,20 @@ class PlaceOptions:
     ] = None
     speed_mps: Annotated[
         float | None,
-        _option(_PLACE, "--speed", min=0.01, help="Speed of the drives in m/s.", show_default="the car's"),
+        _option(
+            _PLACE,
+            "--speed",
+            min=0.01,
+            max=50.0,
+            help="Speed of the drives in m/s.",
+            show_default="the car's",
+        ),
     ] = None
     camera_height_m: Annotated[
         float | None,
-        _option(_PLACE, "--camera-height", min=0.01, help="Height of the driving camera in metres."),
+        _option(
+            _PLACE, "--camera-height", min=0.01, max=20.0, help="Height of the driving camera in metres."
+        ),
     ] = None
     path: Annotated[
         str | None,
@@ -196,6 +205,9 @@ def _minutes(text: str) -> float:
     return float(found[1]) * _UNITS_MIN[found[2] or "m"]
 
 
+_WIDEST_M = 20.0
+
+
 def _limit_m(options: PlaceOptions) -> float | None:
     """What the user said; None where nothing was, or as the world declares."""
     text = options.limit
@@ -205,9 +217,9 @@ def _limit_m(options: PlaceOptions) -> float | None:
         value = float(text)
     except ValueError:
         value = -1.0
-    if not value > 0.0:
+    if not 0.0 < value <= _WIDEST_M:
         raise ConfigError(
-            f"--limit: expected metres above 0, or {OFF_LANE} with a world, which declares its lanes, got {text!r}"
+            f"--limit: expected metres above 0 and at most {_WIDEST_M:g}, not cm or mm, or {OFF_LANE} with a world, which declares its lanes, got {text!r}"
         )
     return value
 

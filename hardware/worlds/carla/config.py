@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import LengthM, StrictModel
 from hardware.worlds.junction.config import DubinsConfig
 from hardware.worlds.lab.config import CameraConfig, PhotoConfig
 
@@ -113,9 +113,9 @@ class BodyConfig(StrictModel):
     """
 
     blueprint: str | None = "vehicle.lincoln.mkz_2020"
-    origin_ahead_m: float = 1.4
-    half_length_m: float = Field(default=2.45, gt=0.0)
-    half_width_m: float = Field(default=0.9, gt=0.0)
+    origin_ahead_m: LengthM = 1.4
+    half_length_m: LengthM = Field(default=2.45, gt=0.0)
+    half_width_m: LengthM = Field(default=0.9, gt=0.0)
     solid: tuple[str, ...] = (
         "Buildings",
         "Walls",

@@ -6,7 +6,7 @@ import math
 
 from pydantic import Field, model_validator
 
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import AngularRate, LagS, LengthM, SpeedMps, StrictModel
 from hardware.worlds.junction.paths import PathName, junction_paths
 from hardware.worlds.lab.config import CameraConfig, PhotoConfig
 from hardware.worlds.paths import ReferencePath
@@ -58,13 +58,13 @@ class DubinsConfig(StrictModel):
         body_ahead_m: Middle of the body ahead of the reference point, which moves along the heading [m].
     """
 
-    speed_mps: float = Field(default=6.0, gt=0.0)
-    max_turn_rate_radps: float = Field(default=1.2, gt=0.0)
-    turn_rate_lag_s: float = Field(default=0.12, ge=0.0)
+    speed_mps: SpeedMps = Field(default=6.0, gt=0.0)
+    max_turn_rate_radps: AngularRate = Field(default=1.2, gt=0.0)
+    turn_rate_lag_s: LagS = Field(default=0.12, ge=0.0)
     turn_rate_gain: float = Field(default=1.02, gt=0.0)
-    body_length_m: float = Field(default=3.6, gt=0.0)
-    body_width_m: float = Field(default=1.6, gt=0.0)
-    body_ahead_m: float = 1.2
+    body_length_m: LengthM = Field(default=3.6, gt=0.0)
+    body_width_m: LengthM = Field(default=1.6, gt=0.0)
+    body_ahead_m: LengthM = 1.2
 
     @classmethod
     def ideal(cls) -> DubinsConfig:

@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from advnerf_core.geometry import Array, Pinhole, camera_mount, make_transform, rotation_z
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import Angle, AngularRate, LagS, LengthM, RightAngleRad, SpeedMps, StrictModel
 
 Colour = tuple[float, float, float]
 Matrix3 = tuple[Colour, Colour, Colour]
@@ -87,10 +87,10 @@ class CameraConfig(PhotoConfig):
     height: int = Field(default=188, gt=0)
     horizontal_fov_deg: float = Field(default=88.0, gt=0.0, lt=170.0)
     rate_hz: float = Field(default=10.0, gt=0.0)
-    x_m: float = 0.30
-    y_m: float = 0.0
-    z_m: float = Field(default=0.20, gt=0.0)
-    pitch_down_rad: float = math.radians(10.0)
+    x_m: LengthM = 0.30
+    y_m: LengthM = 0.0
+    z_m: LengthM = Field(default=0.20, gt=0.0)
+    pitch_down_rad: RightAngleRad = math.radians(10.0)
 
     @property
     def T_car_from_camera(self) -> Array:
@@ -113,8 +113,8 @@ class PhoneConfig(PhotoConfig):
     horizontal_fov_deg: float = Field(default=65.0, gt=0.0, lt=170.0)
     colour_matrix: Matrix3 = ((0.99, 0.05, -0.01), (0.02, 0.95, 0.01), (0.00, 0.04, 0.89))
     gamma: float = Field(default=0.95, gt=0.0)
-    mount_height_m: tuple[float, float] = (0.19, 0.32)
-    walk_height_m: tuple[float, float] = (0.9, 1.7)
+    mount_height_m: tuple[LengthM, LengthM] = (0.19, 0.32)
+    walk_height_m: tuple[LengthM, LengthM] = (0.9, 1.7)
 
 
 class PanelConfig(StrictModel):
@@ -134,10 +134,10 @@ class PanelConfig(StrictModel):
     x_m: float
     y_m: float
     z_m: float
-    yaw_rad: float
-    width_m: float = Field(gt=0.0)
-    height_m: float = Field(gt=0.0)
-    thickness_m: float = Field(gt=0.0)
+    yaw_rad: Angle
+    width_m: LengthM = Field(gt=0.0)
+    height_m: LengthM = Field(gt=0.0)
+    thickness_m: LengthM = Field(gt=0.0)
     rgb: Colour
 
     @property
@@ -209,11 +209,11 @@ class CarConfig(StrictModel):
         command_delay_s: From image capture to the command reaching the actuators in the synchronous lab [s].
     """
 
-    wheelbase_m: float = Field(default=0.25, gt=0.0)
-    body_length_m: float = Field(default=0.508, gt=0.0)
-    body_width_m: float = Field(default=0.292, gt=0.0)
-    body_height_m: float = Field(default=0.195, gt=0.0)
-    speed_mps: float = 0.8
+    wheelbase_m: LengthM = Field(default=0.25, gt=0.0)
+    body_length_m: LengthM = Field(default=0.508, gt=0.0)
+    body_width_m: LengthM = Field(default=0.292, gt=0.0)
+    body_height_m: LengthM = Field(default=0.195, gt=0.0)
+    speed_mps: SpeedMps = Field(default=0.8, gt=0.0)
     nominal_servo_gain: float = -1.2135
     nominal_servo_offset: float = 0.5304
     servo_min: float = 0.15
@@ -223,14 +223,14 @@ class CarConfig(StrictModel):
     true_servo_gain: float = -1.2135 * 1.025
     true_servo_offset: float = 0.5304 + 0.003
     true_erpm_gain: float = Field(default=4614.0 * 1.02, gt=0.0)
-    steering_lag_s: float = Field(default=0.06, gt=0.0)
-    steering_slew_radps: float = Field(default=3.2, gt=0.0)
-    motor_lag_s: float = Field(default=0.15, gt=0.0)
-    drag_stop_lag_s: float = Field(default=0.20, gt=0.0)
+    steering_lag_s: LagS = Field(default=0.06, gt=0.0)
+    steering_slew_radps: AngularRate = Field(default=3.2, gt=0.0)
+    motor_lag_s: LagS = Field(default=0.15, gt=0.0)
+    drag_stop_lag_s: LagS = Field(default=0.20, gt=0.0)
     friction_mps2: float = Field(default=0.6, ge=0.0)
     acceleration_per_amp_mps2: float = Field(default=0.16, ge=0.0)
     grip_mps2: float = Field(default=6.0, gt=0.0)
-    command_delay_s: float = Field(default=0.05, ge=0.0)
+    command_delay_s: LagS = Field(default=0.05, ge=0.0)
 
     def servo_from_steering(self, steering_rad: float) -> float:
         """Servo position the driver sends for a steering angle: nominal mapping, clipped to the servo's limits."""

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from advnerf_core.driving.path import Line
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Array, Pinhole
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import Angle, LengthM, SpeedMps, StrictModel
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
 from hardware.worlds.paths import ReferencePath, Segment
 from hardware.worlds.world import Box, CarDescription, WorldDescription, WorldError
@@ -21,7 +21,7 @@ from nodes.lab.worlds.undriven import Undriven
 
 SCENE, PATH = "scene", "track"
 _FILES = ("camera", "vehicle", "room")
-Pose = tuple[float, float, float]
+Pose = tuple[float, float, Angle]
 
 
 class OwnSceneConfig(StrictModel):
@@ -46,8 +46,8 @@ class OwnSceneConfig(StrictModel):
     room: NamedFile | None = None
     start: Pose | None = None
     goal: tuple[float, ...] = ()
-    speed_mps: Annotated[float, Field(gt=0.0)] = 0.8
-    depth_tolerance_m: Annotated[float, Field(ge=0.0)] = 0.15
+    speed_mps: Annotated[SpeedMps, Field(gt=0.0)] = 0.8
+    depth_tolerance_m: Annotated[LengthM, Field(ge=0.0)] = 0.15
 
     @model_validator(mode="before")
     @classmethod

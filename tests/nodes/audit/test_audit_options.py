@@ -19,7 +19,7 @@ from nodes.audit.cars import CARS, car_of
 from nodes.audit.images import posed
 from nodes.audit.places import Answers, AuditedWorld, place_of_photographs
 from nodes.audit.policies import resolve_policy
-from nodes.cli.audit import _minutes
+from nodes.cli.audit import PlaceOptions, _limit_m, _minutes
 from nodes.experiment.show.experiment_world import as_json
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.errors import ConfigError
@@ -41,6 +41,12 @@ def test_wrong_options_are_no_verdict(tmp_path: Path, options: list[str], messag
         command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600, check=False
     )
     assert (found.returncode, message in found.stderr) == (64, True), found.stderr
+
+
+@pytest.mark.parametrize("text", ["40", "inf", "nan", "-1", "off-lane"])
+def test_half_a_lane_is_in_metres(text: str) -> None:
+    with pytest.raises(ConfigError, match="--limit: expected metres above 0 and at most 20, not cm or mm"):
+        _limit_m(PlaceOptions(limit=text))
 
 
 def test_the_schema_of_results_is_printed(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Worlds by name: built in, a file's, an installed package's; their configuration, and what of it results depend on."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -163,6 +164,28 @@ def test_a_world_that_lacks_something_is_told_what(yard: Path) -> None:
         match=r"world yard\.py:Lacking: expected T_car_from_camera, __enter__.*photograph.* which it lacks",
     ):
         read(yard, "kind: yard.py:Lacking").make()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("kind: junction\ncar: {speed_mps: 60}", "car.speed_mps: expected at most 50 m/s, not km/h or mm/s, got 60"),
+        ("kind: junction\ncar: {body_width_m: 160}", "car.body_width_m: expected at most 20 m, not cm or mm"),
+        ("kind: junction\ncar: {turn_rate_lag_s: 120}", "car.turn_rate_lag_s: expected at most 5 s, not ms"),
+        ("kind: junction\ncamera: {pitch_down_rad: 8}", "camera.pitch_down_rad: expected at most 1.5708 rad, not degrees"),
+        ("kind: carla\nbody: {half_width_m: 90}", "body.half_width_m: expected at most 20 m, not cm or mm"),
+        ("kind: lab\ncar: {speed_mps: 800}", "car.speed_mps: expected at most 50 m/s"),
+        ("kind: lab\ncar: {speed_mps: -0.8}", "car.speed_mps"),
+        ("kind: lab\ncar: {wheelbase_m: 250}", "car.wheelbase_m: expected at most 20 m"),
+        ("kind: scene\nfile: a\ncamera: a\nvehicle: a\nroom: a\nspeed_mps: 80", "speed_mps: expected at most 50 m/s"),
+        ("kind: scene\nfile: a\ncamera: a\nvehicle: a\nroom: a\nstart: [0, 0, 90]", "as degrees that is 1.5708"),
+    ],
+)  # fmt: skip
+def test_numbers_of_a_world_in_other_units_are_one_line(yard: Path, change: str, message: str) -> None:
+    (yard / "a").touch()
+    with pytest.raises(ConfigError, match=re.escape(message)) as error:
+        read(yard, change)
+    assert "\n" not in str(error.value)
 
 
 def test_settings_without_some_keys() -> None:

@@ -234,6 +234,7 @@ def test_an_open_path_from_a_file(tmp_path: Path) -> None:
         ({"path": "images_of_mine/transforms.json", "camera": {"z_m": 0}}, "camera.z_m"),
         ({"path": "images_of_mine/images/00000.png"}, "expected ground_z_m and camera.pitch_down_rad"),
         ({"car": {}}, "car.speed_mps is missing"),
+        ({"off_track_m": 40}, "off_track_m: expected at most 20 m, not cm or mm, got 40"),
         ({"camera": {"z_m": 200}}, "camera.z_m: expected at most 20 m, not cm or mm, got 200"),
         (
             {"camera": {"z_m": 0.2, "pitch_down_rad": 10}},

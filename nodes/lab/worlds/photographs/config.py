@@ -11,8 +11,7 @@ from pydantic import AfterValidator, Field, ValidationInfo, computed_field, mode
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import PosedImages
 from advnerf_core.geometry import Pinhole
-from advnerf_core.strict import StrictModel
-from calibration.schema import LengthM, RightAngleRad, SpeedMps
+from advnerf_core.strict import AngularRate, LengthM, RightAngleRad, SpeedMps, StrictModel
 from hardware.worlds.world import CarDescription
 from nodes.lab.located import content_sha256, located
 
@@ -38,7 +37,7 @@ class DrivenCarConfig(StrictModel):
 
     speed_mps: SpeedMps = Field(gt=0.0)
     wheelbase_m: Annotated[LengthM, Field(gt=0.0)] | None
-    max_steering_rad: AboveZero
+    max_steering_rad: Annotated[AngularRate, Field(gt=0.0)]
 
     @model_validator(mode="after")
     def _wheels_turn_less_than_sideways(self) -> DrivenCarConfig:
@@ -93,7 +92,7 @@ class PhotographsConfig(StrictModel):
     images: Located = Field(exclude=True)
     path: Located = Field(default=DRIVEN, exclude=True)
     closed: bool = False
-    off_track_m: AboveZero
+    off_track_m: Annotated[LengthM, Field(gt=0.0)]
     ground_z_m: float | None = None
     car: DrivenCarConfig
     camera: MountedCameraConfig
