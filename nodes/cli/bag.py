@@ -166,7 +166,9 @@ def bag_record(
 @app.command("play")
 def bag_play(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
-    rate: Annotated[float, typer.Option(min=0.001, help="Speed relative to the recording.")] = 1.0,
+    rate: Annotated[
+        float, typer.Option(min=0.001, max=1000.0, help="Speed relative to the recording.")
+    ] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="Start over at the end.")] = False,
     offset_s: Annotated[
         float,

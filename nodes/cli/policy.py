@@ -200,11 +200,24 @@ def policy_export(
     ] = None,
 ) -> None:
     """Export a policy and its declaration to a file that does not need the policy's source code."""
-    from advnerf_core.policies.load import load_adapted, load_any_policy
+    from advnerf_core.files import refuse_overwriting
+    from advnerf_core.policies.load import is_code, load_adapted, load_any_policy
     from nodes.runtime.errors import ConfigError
 
     if onnx is None and pt2 is None:
         raise ConfigError("expected --onnx FILE or --pt2 FILE, got neither; give at least one")
+    for option, file in (("onnx", onnx), ("pt2", pt2)):
+        if file is not None and file.suffix != f".{option}":  # which a policy is recognised by
+            raise ConfigError(
+                f"--{option}: expected a file name that ends with .{option}, got {file}; correct it"
+            )
+    if not is_code(policy) and Path(policy).suffix == ".onnx":
+        raise ConfigError(
+            f"expected a policy with its network in torch, got {policy}, which cannot be converted; "
+            "name the policy that it was exported from"
+        )
+    given = None if is_code(policy) else Path(policy)
+    refuse_overwriting([given], [each for each in (onnx, pt2) if each is not None])
     load_any_policy(policy)  # rejects a policy that nodes could not load
     adapted, _ = load_adapted(policy)
     adapted.requires_grad_(False)

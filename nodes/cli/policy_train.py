@@ -45,13 +45,14 @@ class ExpertOptions:
         ),
     ] = None
     speed_mps: Annotated[
-        float, typer.Option("--speed", min=0.1, help="Speed at which the policy will drive [m/s].")
+        float, typer.Option("--speed", min=0.1, max=50.0, help="Speed at which the policy will drive [m/s].")
     ] = 0.8
     delay_s: Annotated[
         float,
         typer.Option(
             "--delay",
             min=0.0,
+            max=5.0,
             help="Delay from an image to the resulting wheel angle that the labels account for [s].",
         ),
     ] = 0.16
@@ -117,7 +118,7 @@ def train(
     ] = Path("room"),
     setting: Annotated[str, typer.Option(help="Setting of that run.")] = "demo",
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 800,
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Random seed.")] = 0,
     architecture: Annotated[
         str, typer.Option(help="pilotnet, resnet, vit_tiny, or file.py:Class of your own.")
     ] = "pilotnet",
@@ -202,8 +203,14 @@ def evaluate(
         typer.Option("--held-out", help="Compare only the frames that a training on this log keeps out."),
     ] = False,
     maps: Annotated[
-        int, typer.Option("--saliency", min=0, help="Number of frames for which a saliency map is drawn.")
-    ] = 8,
+        int | None,
+        typer.Option(
+            "--saliency",
+            min=0,
+            help="Number of frames for which a saliency map is drawn.",
+            show_default="8, or 0 for a policy without a gradient",
+        ),
+    ] = None,
     video: Annotated[bool, typer.Option("--video", help="Also write all saliency maps as a video.")] = False,
     goal: Goal = None,
 ) -> None:
@@ -214,26 +221,57 @@ def evaluate(
     from nodes.lab.policy_data.recordings import crop_notes, recorded_frames
 
     loaded = load_any_policy(policy)
+    goals = tuple(goal or ())
+    has_gradient = bool(getattr(loaded.policy, "differentiable", True))
+    _require_fitting(loaded.policy.goal_size, goals, has_gradient or not (maps or video))
+    count = 8 * has_gradient if maps is None else maps
     opened = open_logs(logs, log_options.choice(), labels)
     expert = expert_options.expert(opened)
-    goals = tuple(goal or ())
+    folders = _folders(output, opened)
     rows = table(
         "log", "predicted against", "frames", "mean |error|", "RMS", "worst", "bias", "r", "straight on"
     )
     written = []
-    for each in opened:
+    for each, folder in zip(opened, folders, strict=True):
         found = recorded_frames(each, loaded.view, expert)
         predicted = measure.predict(loaded.policy, found.frames.images, goals)
         for name, errors in measure.compared(found, predicted, labels, held_out).items():
             rows.add_row(each.name, name, *_error_cells(errors))
-        folder = (output or Path("runs")) / f"eval_{each.log.path.resolve().parent.name}_{each.log.path.stem}"
-        folder = output if output is not None and len(opened) == 1 else folder
         folder.mkdir(parents=True, exist_ok=True)
         measure.draw(found, predicted, f"{policy} on {each.name}", folder / "steering.png")
-        files = measure.write_saliency(loaded.policy, found, folder, maps, video, goals)
+        files = measure.write_saliency(loaded.policy, found, folder, count, video, goals)
         written.append(f"{folder / 'steering.png'}, {len(files)} saliency files in {folder}")
     print_table(rows)
     print("\n".join([*crop_notes(opened, loaded.view), *written]))
+
+
+def _require_fitting(goal_size: int, goals: tuple[float, ...], has_maps: bool) -> None:
+    from nodes.runtime.errors import ConfigError
+
+    if len(goals) != goal_size:
+        raise ConfigError(
+            f"expected a goal of {goal_size} numbers for this policy, got {len(goals)}; give --goal for each number"
+        )
+    if not has_maps:
+        raise ConfigError(
+            "expected a policy with a gradient for --saliency and --video, got one without; leave them out, or give the policy that it was "
+            "exported from"
+        )
+
+
+def _folders(output: Path | None, logs: list[OpenLog]) -> list[Path]:
+    """One folder for each log; logs of the same name are numbered."""
+    if output is not None and len(logs) == 1:
+        return [output]
+    folders: list[Path] = []
+    for each in logs:
+        first = (output or Path("runs")) / f"eval_{each.log.path.resolve().parent.name}_{each.log.path.stem}"
+        names = (
+            first.with_name(f"{first.name}{ending}")
+            for ending in ("", *(f"_{k}" for k in range(2, len(logs) + 1)))
+        )
+        folders.append(next(name for name in names if name not in folders))
+    return folders
 
 
 def _error_cells(e: Errors) -> list[str]:

@@ -74,7 +74,10 @@ def replay(
             "expected --topics and --tolerance only with --golden FILE; add --golden or remove them"
         )
     written = (json_file, plot, golden if update_golden else None)
-    refuse_overwriting((bag, launch, attack), [each for each in written if each is not None])
+    refuse_overwriting(
+        (bag, launch, attack, Path(policy) if policy else None),
+        [each for each in written if each is not None],
+    )
     choice = _choice(
         nodes or (_RETRO_NODES if attack else ""), replace or [], launch, policy, overrides or []
     )

@@ -336,13 +336,13 @@ def test_a_missing_extra_is_named_with_its_installation(monkeypatch, capsys):
 
 
 def test_a_replay_overwrites_nothing_that_it_was_given(command, tmp_path):
-    bag, attack = tmp_path / "drive.mcap", tmp_path / "a.safetensors"
-    for file in (bag, attack):
+    bag, attack, policy = (tmp_path / name for name in ("drive.mcap", "a.safetensors", "policy.safetensors"))
+    for file in (bag, attack, policy):
         file.write_text(file.name)
-    given = ("bag", "replay", bag, "--attack", attack)
-    for output in (("--json", attack), ("--plot", bag)):
+    given = ("bag", "replay", bag, "--attack", attack, "--policy", policy)
+    for output in (("--json", attack), ("--plot", bag), ("--json", policy)):
         code, _, errors = command(*given, *output)
         assert (code, "would be overwritten" in errors) == (2, True), errors
     code, _, errors = command("bag", "replay", bag, "--golden", bag, "--update-golden")
     assert (code, "would be overwritten" in errors) == (2, True), errors
-    assert [file.read_text() for file in (bag, attack)] == [bag.name, attack.name]
+    assert all(file.read_text() == file.name for file in (bag, attack, policy))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Literal, get_args
 from advnerf_core.errors import AdvnerfError
 
 Side = Literal["left", "right"]
-_SETTINGS = re.compile(r"(?P<path>.+?),(?P<settings>[a-z-]+=.*)")
+_SETTINGS = re.compile(r"(?P<path>.+?),(?P<settings>\s*[a-z_-]+\s*=.*)")
 
 
 class LogError(AdvnerfError, ValueError):
@@ -42,6 +43,11 @@ class LogChoice:
                 f"steering-full-rad: expected a positive wheel angle [rad], got {full_rad:g}; "
                 "give the side with steering-positive"
             )
+        offset_rad = self.steering_offset_rad
+        if offset_rad is not None and not abs(offset_rad) < 0.5 * math.pi:
+            raise LogError(
+                f"steering-offset-rad: expected an angle of less than 1.5708 rad, not degrees, got {offset_rad:g}; correct it"
+            )
         if positive is not None and positive not in get_args(Side):
             raise LogError(f"steering-positive: expected left or right, got {positive!r}")
 
@@ -54,6 +60,8 @@ class LogChoice:
             if key not in self.__dataclass_fields__:
                 known = ", ".join(field.replace("_", "-") for field in self.__dataclass_fields__)
                 raise LogError(f"expected settings of a log among {known}, got {part!r}")
+            if key in found:
+                raise LogError(f"{name.strip()} is given twice, {found[key]} and {value}; remove one of them")
             found[key] = _number(name, value) if key.endswith("_rad") else value
         return replace(self, **found)  # type: ignore[arg-type]
 

@@ -70,7 +70,7 @@ def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
     return DriveLog(
         path,
         "CSV file of Udacity's simulator" if is_udacity else "CSV file",
-        (path,),
+        (path, *files),
         images,
         _CAMERAS if is_udacity else (images,),
         tuple(name for name in (rows[0].values if rows else ()) if name not in (*_CAMERAS, images)),

@@ -71,7 +71,7 @@ def read_tub(path: Path, choice: LogChoice) -> DriveLog:
     return DriveLog(
         path,
         f"Donkeycar tub, version {version}",
-        files,
+        (*files, *(each.folder / str(each.values[images]) for each in driven)),
         images,
         cameras,
         tuple(

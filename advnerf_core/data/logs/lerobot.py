@@ -131,7 +131,7 @@ def read_lerobot(path: Path, choice: LogChoice) -> DriveLog:
     return DriveLog(
         path,
         f"LeRobot data set, {data.version}",
-        (path / INFO, *data.tables),
+        (path / INFO, *data.tables, *sorted((path / "videos").rglob("*.mp4"))),
         images,
         cameras,
         controls,

@@ -152,10 +152,15 @@ def draw(recording: RecordedFrames, predicted_rad: NDArray[np.float64], title: s
 def write_saliency(
     policy: Any, recording: RecordedFrames, out: Path, count: int, video: bool, goal: tuple[float, ...] = ()
 ) -> list[Path]:
-    """Write PNG files of ``count`` frames spread over the recording, image above saliency, and with ``video`` an MP4 of all frames."""
+    """Write PNG files of ``count`` frames spread over the recording, image above saliency, and with ``video`` an MP4 of all frames.
+
+    Those of an earlier call are removed from the folder.
+    """
     images = recording.frames.images
     chosen = np.unique(np.linspace(0, len(images) - 1, min(count, len(images))).round().astype(int))
     out.mkdir(parents=True, exist_ok=True)
+    for old in (*out.glob("saliency_" + 5 * "[0-9]" + ".png"), out / "saliency.mp4"):
+        old.unlink(missing_ok=True)
     files = []
     for index, share in (
         zip(chosen, saliency(policy, images[chosen], goal), strict=True) if len(chosen) else ()

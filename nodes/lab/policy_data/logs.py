@@ -70,7 +70,7 @@ def open_log(path: Path, choice: LogChoice | None = None) -> DriveLog:
         AdvnerfError: The format is unknown, or the log is damaged.
     """
     choice = choice or LogChoice()
-    if path.suffix == ".csv":
+    if path.suffix.lower() == ".csv":
         return read_csv_log(path, choice)
     if path.suffix in SUFFIXES or path.name == METADATA_FILE:
         return read_bag_log(path, choice)

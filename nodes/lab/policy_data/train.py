@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -27,6 +28,8 @@ from nodes.lab.policy_data.recordings import recorded_frames
 from nodes.runtime.progress import Report
 
 POLICY = "policy.safetensors"
+_FRAMES = "frames"
+_IS_DIGEST = re.compile("[0-9a-f]{16}")
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ def train_from_recordings(
     }
     work = out / "work" / _digest(claim)
     report: Report = progress or (lambda share, text="": None)
-    store = FrameStore(work / "frames")
+    store = FrameStore(work / _FRAMES)
     left_out = {log.name: _cut(log, digests[log.name], view, expert, store, work, report) for log in logs}
     if surrogate is None:
         sha256, mae = _clone(store, view, expert, config, work, {"recordings": digests}, report)
@@ -90,10 +93,15 @@ def train_from_recordings(
     result = Training(out / POLICY, sha256, mae, {**named, **frames}, left_out, unchecked)
     summary = {**asdict(result), "path": POLICY, "settings": claim}
     write_json(out / "policy.json", summary)
-    for old in (out / "work").iterdir():
-        if old != work:
-            shutil.rmtree(old, ignore_errors=True)
+    _remove_earlier(work)
     return result
+
+
+def _remove_earlier(work: Path) -> None:
+    """Remove the work of earlier trainings beside ``work``, and no other folder that the user keeps there."""
+    for old in work.parent.iterdir():
+        if old != work and _IS_DIGEST.fullmatch(old.name) and (old / _FRAMES).is_dir():
+            shutil.rmtree(old, ignore_errors=True)
 
 
 def _cut(
@@ -154,7 +162,10 @@ def _shard(digest: str) -> str:
 
 def _digest_of(opened: OpenLog) -> str:
     """Digest of a log's files and options. Where sizes or times of files change, it counts as another log."""
-    files = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in opened.log.files]
+    stats = [
+        (file.name, file.stat()) for file in opened.log.files if file.exists()
+    ]  # what is missing is told when it is read
+    files = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     return _digest([opened.name, files, {**asdict(opened.choice), "labels": opened.labels}])
 
 

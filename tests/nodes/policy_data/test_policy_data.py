@@ -1,5 +1,6 @@
 """Foreign logs, error figures against numpy, saliency of a network whose gradient is known, training that resumes."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -199,7 +200,16 @@ def test_training_learns_is_kept_and_begins_anew_for_other_recordings(tmp_path, 
     assert load_policy(first.path).sha256 == first.sha256
     assert train().sha256 == first.sha256
     assert len(cuts) == 1
+    mine = tmp_path / "out" / "work" / "mine" / "thesis.tex"
+    mine.parent.mkdir()
+    mine.write_text("of the user, who keeps it here")
     write_log(tmp_path, rows=9)
     assert train().frames == {"log": 9}
     assert len(cuts) == 2
-    assert len(list((tmp_path / "out" / "work").iterdir())) == 1
+    image = sorted(tmp_path.rglob("*.png"))[0]
+    assert image in open_log(log, CHOICE).files
+    os.utime(image, (0, 0))
+    train()
+    assert len(cuts) == 3, "another image is another log, although its table is the same"
+    assert mine.exists()
+    assert len(list((tmp_path / "out" / "work").iterdir())) == 2
