@@ -95,8 +95,8 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
     listed = content.get("frames")
     if not isinstance(listed, list) or not listed:
         raise DatasetError(f"expected a list 'frames' in {path}, got {type(listed).__name__} without entries")
-    split_of, frames, missing = _listed_splits(path, content), list[PosedImage](), list[Path]()
-    wrong = list[DatasetError]()
+    split_of, frames, missing = _listed_splits(path, content, listed), list[PosedImage](), list[Path]()
+    wrong, reasons = list[DatasetError](), set[str]()
     for number, entry in enumerate(listed):
         try:
             name = _name_of(entry)
@@ -109,6 +109,9 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
         except ValueError as error:
             label = f" ({entry['file_path']})" if isinstance(entry, dict) and "file_path" in entry else ""
             wrong.append(DatasetError(f"{path}: frame {number}{label}: {error}"))
+            reasons.add(str(error))
+    if 1 < len(wrong) == len(listed) - len(missing) and len(reasons) == 1:  # a value of the whole file
+        raise DatasetError(f"{path}: every frame: {reasons.pop()}")
     raise_all(wrong, len(listed), "frames")
     if missing and (require_all or not frames):
         raise DatasetError(
@@ -136,14 +139,24 @@ def _read_json(path: Path) -> _Values:
     return content
 
 
-def _listed_splits(path: Path, content: _Values) -> dict[str, str]:
-    """nerfstudio's lists of file names by split."""
+def _listed_splits(path: Path, content: _Values, listed: Sequence[Any]) -> dict[str, str]:
+    """nerfstudio's lists of file names by split.
+
+    Raises:
+        DatasetError: A list is none, or no frame has any of its names: its images would be in no split.
+    """
     splits: dict[str, str] = {}
+    known = {_normal(str(entry.get("file_path"))) for entry in listed if isinstance(entry, dict)}
     for split in _SPLITS:
         names = content.get(f"{split}_filenames", [])
         if not isinstance(names, list):
             raise DatasetError(
                 f"{path}: {split}_filenames: expected a list of files, got {type(names).__name__}"
+            )
+        if names and not any(_normal(str(name)) in known for name in names):
+            raise DatasetError(
+                f"{path}: {split}_filenames: expected names as the frames' file_path has them, got {len(names)} that no frame has, the first "
+                f"is {names[0]!r:.80}; correct them, or remove the list"
             )
         splits.update({_normal(str(name)): split for name in names})
     return splits
@@ -157,11 +170,12 @@ def _ngp_box(path: Path, content: _Values) -> tuple[float, tuple[float, float, f
             if content.get("aabb_scale") is not None
             else None
         )
-        raw = content.get("offset", NGP_OFFSET)
-        x, y, z = (float(v) for v in (raw if isinstance(raw, list | tuple) else [raw] * 3))
-        if not np.isfinite([x, y, z]).all():
-            raise ValueError(f"offset: expected three finite numbers, got {raw}")
-    except (ValueError, TypeError) as error:
+        raw = content.get("offset")
+        given = NGP_OFFSET if raw is None else raw if isinstance(raw, list) else [raw] * 3
+        if len(given) != 3:
+            raise ValueError(f"offset: expected one number or three, got {len(given)}")
+        x, y, z = (_number({"offset": value}, "offset", math.nan) for value in given)
+    except ValueError as error:
         raise DatasetError(f"{path}: {error}") from error
     return scale, (x, y, z), aabb
 
@@ -230,10 +244,13 @@ def _refuse_far_away(path: Path, frames: Sequence[PosedImage]) -> None:
 
 
 def _lens(values: _Values) -> Lens:
-    model = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"))
-    if model not in _LENSES | _FISHEYES or values.get("is_equirectangular") or values.get("equirectangular"):
+    is_fisheye = _flag(values, "is_fisheye")
+    model = str(values.get("camera_model", "OPENCV_FISHEYE" if is_fisheye else "OPENCV"))
+    panorama = next((key for key in ("is_equirectangular", "equirectangular") if _flag(values, key)), None)
+    if panorama is not None or model not in _LENSES | _FISHEYES:
+        got = model if panorama is None else f"{panorama} = true"
         raise ValueError(
-            f"camera_model: expected {', '.join(sorted(_LENSES | _FISHEYES))}, got {model}; undistort the images first"
+            f"camera_model: expected {', '.join(sorted(_LENSES | _FISHEYES))}, got {got}; undistort the images first"
         )
     for key, value in values.items():
         if (
@@ -246,7 +263,7 @@ def _lens(values: _Values) -> Lens:
                 f"{key}: expected a lens of {', '.join(sorted(_LENS_KEYS - {'k5', 'k6'}))} alone, got {key} = {value!r:.60}, which other "
                 "software reads; undistort the images first, or take it out if they are ideal"
             )
-    fisheye = model in _FISHEYES or bool(values.get("is_fisheye"))
+    fisheye = model in _FISHEYES or is_fisheye
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     strange = ("p1", "p2") if fisheye else ("k4", "k5", "k6")
     for key in strange:
@@ -255,6 +272,14 @@ def _lens(values: _Values) -> Lens:
                 f"{key}: expected only {', '.join(keys)} with camera_model {model}, got {values[key]}; undistort the images first"
             )
     return Lens(tuple(_number(values, key, 0.0) for key in keys), fisheye)
+
+
+def _flag(values: _Values, key: str) -> bool:
+    """A switch of the file; Python takes any text for true, also ``"false"``."""
+    value = values.get(key)
+    if value not in (None, False, True):  # 0 and 1 are these
+        raise ValueError(f"{key}: expected true or false, got {value!r:.60}; write it without quotes")
+    return bool(value)
 
 
 def _says_something(value: Any) -> bool:

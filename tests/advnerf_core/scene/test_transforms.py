@@ -247,3 +247,26 @@ def test_keys_of_others_that_change_no_camera_are_told(tmp_path):
     assert listed.with_frames(listed.frames[:1]).remarks == [
         f"no effect here: the keys white_transparent, depth_file_path of {tmp_path / 'transforms.json'}"
     ]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"fl_x": "abc"}, r"every frame: fl_x: expected a number, got 'abc'"),
+        ({"is_fisheye": "false"}, r"every frame: is_fisheye: expected true or false, got 'false'"),
+        ({"is_equirectangular": True}, r"every frame: camera_model: .*got is_equirectangular = true"),
+        ({"offset": [1, 2]}, r"offset: expected one number or three, got 2"),
+        ({"offset": True}, r"offset: expected a number, got True"),
+    ],
+)
+def test_a_wrong_value_of_the_whole_file_is_told_once(tmp_path, content, message):
+    with pytest.raises(DatasetError, match=message) as error:
+        load_transforms(write(tmp_path, **content))
+    assert "\n" not in str(error.value)
+
+
+def test_a_split_names_files_that_frames_have(tmp_path):
+    with pytest.raises(
+        DatasetError, match=r"test_filenames: expected names .* got 1 that no frame has.*images/1\.png"
+    ):
+        load_transforms(write(tmp_path, train_filenames=["0.png"], test_filenames=["images/1.png"]))
