@@ -6,17 +6,18 @@ from typing import Annotated
 
 from pydantic import Field
 
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import Angle, StrictModel
 from nodes.experiment.plan.numbers import Count, Positive
 
 Numbers = Annotated[tuple[float, ...], Field(min_length=1)]
+Angles = Annotated[tuple[Angle, ...], Field(min_length=1)]
 
 
 class LandscapeConfig(StrictModel):
     """A grid over the bounds of one object."""
 
     points: tuple[Positive, Positive] = Field(default=(9, 9), description="Points along x and y.")
-    yaws_rad: tuple[float, ...] = Field(
+    yaws_rad: tuple[Angle, ...] = Field(
         default=(), description="Headings [rad]; the found one if none is given."
     )
 
@@ -27,7 +28,7 @@ class RobustnessMapConfig(StrictModel):
     sideways_m: Numbers = Field(
         default=(-0.6, -0.3, 0.0, 0.3, 0.6), description="Starts: to the left of the first one [m]."
     )
-    turn_rad: Numbers = Field(
+    turn_rad: Angles = Field(
         default=(0.0,), description="Starts: turned to the left [rad]; each with each sideways."
     )
     object_moves_m: tuple[tuple[float, float], ...] = Field(
@@ -35,7 +36,7 @@ class RobustnessMapConfig(StrictModel):
         min_length=1,
         description="Moves of the object along x and y [m].",
     )
-    object_turns_rad: Numbers = Field(
+    object_turns_rad: Angles = Field(
         default=(0.0,), description="Turns of the object [rad]; each with each move."
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import RightAngleRad, StrictModel
 from nodes.experiment.plan.numbers import NotNegative, Positive
 
 
@@ -19,8 +19,8 @@ class RobustnessConfig(StrictModel):
     jitter_m: NotNegative = Field(
         default=0.0, description="Spread of the camera's position in each frame [m]."
     )
-    jitter_rad: NotNegative = Field(
-        default=0.0, description="Spread of the camera's rotation in each frame [rad]."
+    jitter_rad: RightAngleRad = Field(
+        default=0.0, ge=0.0, description="Spread of the camera's rotation in each frame [rad]."
     )
     draws: Positive = Field(
         default=1, description="Drives of each start pose per evaluation, each drawn by itself."

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from advnerf_core.attack.objectives import CTE
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
-from advnerf_core.strict import Angle, StrictModel
+from advnerf_core.strict import Angle, RightAngleRad, StrictModel
 from nodes.experiment.plan.method_names import ArchitectureReference, ObjectiveReference
 from nodes.experiment.plan.numbers import Count, Delay, NotNegative, Positive, PositiveNumber, Unit
 from nodes.experiment.plan.robustness_config import RobustnessConfig
@@ -114,11 +114,11 @@ class PolicyConfig(StrictModel):
         default=12.0,
         description="DAgger drives start so far along each path at most, so that they pass the junction [m]; none: anywhere.",
     )
-    stills_heading_rad: PositiveNumber = Field(
-        default=0.3, description="Stills are turned up to this much from the path [rad]."
+    stills_heading_rad: RightAngleRad = Field(
+        default=0.3, gt=0.0, description="Stills are turned up to this much from the path [rad]."
     )
-    drives_heading_rad: PositiveNumber = Field(
-        default=0.12, description="DAgger drives start turned up to this much [rad]."
+    drives_heading_rad: RightAngleRad = Field(
+        default=0.12, gt=0.0, description="DAgger drives start turned up to this much [rad]."
     )
     own_car: bool = Field(
         default=False,

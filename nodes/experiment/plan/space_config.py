@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import Angle, StrictModel
 from nodes.experiment.plan.numbers import Count, NotNegative, Positive, PositiveNumber, Unit
 from nodes.lab.located import NamedFile
 
@@ -31,7 +31,8 @@ class PlacesConfig(StrictModel):
     samples: Positive = Field(default=5, description="Placements that are drawn.")
     steps: Positive = Field(default=10, description="Evaluations of each placement.")
     move_m: NotNegative = Field(default=1.5, description="An object's x and y may change by this [m].")
-    turn_rad: NotNegative = Field(
+    turn_rad: Angle = Field(
+        ge=0.0,
         default=0.6,
         description="A car's heading may change by this [rad]; a hydrant may turn all the way round.",
     )

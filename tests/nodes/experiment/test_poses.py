@@ -2,10 +2,14 @@
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from advnerf_core.attack.spaces.placement import footprint
 from advnerf_core.geometry import rotation_z, yaw_of
 from hardware.worlds.junction.config import IntersectionConfig
+from nodes.experiment.plan.maps_config import LandscapeConfig, RobustnessMapConfig
+from nodes.experiment.plan.robustness_config import RobustnessConfig
+from nodes.experiment.plan.sections import PolicyConfig
 from nodes.experiment.plan.space_config import PlacesConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import bounds_of, lanes_of, random_placements
@@ -44,3 +48,20 @@ def test_cars_turn_a_little_and_hydrants_all_the_way(trained: Experiment) -> Non
             2 * np.pi if thing.kind == "hydrant" else 2 * PlacesConfig(kind="places").turn_rad
         )
         assert bound.scale is None
+
+
+@pytest.mark.parametrize(
+    ("section", "given"),
+    [
+        (PlacesConfig, {"kind": "places", "turn_rad": 35.0}),
+        (LandscapeConfig, {"yaws_rad": [0.0, 90.0]}),
+        (RobustnessMapConfig, {"turn_rad": [10.0]}),
+        (RobustnessMapConfig, {"object_turns_rad": [-15.0]}),
+        (RobustnessConfig, {"jitter_rad": 2.0}),
+        (PolicyConfig, {"stills_heading_rad": 17.0}),
+        (PolicyConfig, {"drives_heading_rad": 7.0}),
+    ],
+)
+def test_degrees_are_refused_in_each_section(section, given):
+    with pytest.raises(ValidationError, match="degrees"):
+        section.model_validate(given)
