@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 USAGE_EXIT, FAULT_EXIT, CANNOT_JUDGE_EXIT = 64, 70, 2
 _PLACE, _SEARCH, _RESULT = "Place", "Search", "Result"
 _UNITS_MIN = {"s": 1 / 60, "m": 1.0, "h": 60.0}
+_WIDEST_M = 20.0
 OFF_LANE = "off-lane"
 
 
@@ -205,9 +206,6 @@ def _minutes(text: str) -> float:
     return float(found[1]) * _UNITS_MIN[found[2] or "m"]
 
 
-_WIDEST_M = 20.0
-
-
 def _limit_m(options: PlaceOptions) -> float | None:
     """What the user said; None where nothing was, or as the world declares."""
     text = options.limit
@@ -289,6 +287,12 @@ def _audit(
     overrides: list[str],
     began_s: float,
 ) -> Audit:
+    # What is wrong in the command is told before seconds of imports.
+    wanted_m, minutes = _limit_m(place), _minutes(search.budget)
+    if search.kind != "panel" and not Path(search.kind).is_file():
+        raise ConfigError(
+            f"--object: expected panel, or a .glb or .object.safetensors file, got {search.kind}, which is not there"
+        )
     from rich.console import Console
 
     from nodes.audit.asking import answer
@@ -299,11 +303,7 @@ def _audit(
     from nodes.audit.question import CI_SECTIONS, AuditedQuestion
     from nodes.audit.run import CI_EVALUATIONS, Audit
 
-    if search.kind != "panel" and not Path(search.kind).is_file():
-        raise ConfigError(
-            f"--object: expected panel, or a .glb or .object.safetensors file, got {search.kind}, which is not there"
-        )
-    answers = Answers(_limit_m(place), place.speed_mps, place.camera_height_m, place.path)
+    answers = Answers(wanted_m, place.speed_mps, place.camera_height_m, place.path)
     limit_m, declared, folder = answers.limit_m, place.declared or [], result.output
     if place.place is not None:
         named = answer(
@@ -341,7 +341,7 @@ def _audit(
         folder,
         _say,
         Console(),
-        minutes=_minutes(search.budget),
+        minutes=minutes,
         evaluations=search.evaluations or (CI_EVALUATIONS if result.ci else None),
         against=result.against,
         harden=result.harden,

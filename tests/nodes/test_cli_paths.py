@@ -57,10 +57,13 @@ def test_every_path_that_a_command_reads_is_checked_as_it_is_parsed():
         ("log", "info", "nope,images=left"),
         ("policy", "check", "nope.onnx"),
         ("policy", "eval", "nope:factory", "nope"),
+        ("audit", "mine.onnx", "--world", "lab", "--limit", "nope"),
+        ("audit", "mine.onnx", "--world", "lab", "--budget", "nope"),
+        ("audit", "mine.onnx", "--world", "lab", "--object", "nope"),
     ],
     ids=" ".join,
 )
-def test_a_wrong_path_costs_no_heavy_import(tmp_path, arguments):
+def test_a_wrong_path_or_value_costs_no_heavy_import(tmp_path, arguments):
     program = (
         "import sys\nfrom nodes.cli import main\n"
         f"sys.argv = ['advnerf', *{arguments!r}]\n"
@@ -75,6 +78,6 @@ def test_a_wrong_path_costs_no_heavy_import(tmp_path, arguments):
         timeout=600,
         env={"PYTHONPATH": str(Path(__file__).parents[2]), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
     )
-    assert ran.stdout.split() == ["code", "2", "heavy", "[]"], ran.stderr
+    assert ran.stdout.split() == ["code", "64" if arguments[0] == "audit" else "2", "heavy", "[]"], ran.stderr
     assert "nope" in ran.stderr
     assert not (tmp_path / "out").exists()
