@@ -29,6 +29,13 @@ _RESUMABLE = (
     ("car", "trial"),
 )
 
+# Of outputs; inputs are checked as they are parsed.
+_IN_THE_WAY = {
+    FileExistsError: "a folder at {}, or nothing, got a file or a link to nothing",
+    NotADirectoryError: "folders on the way to {}, got a file",
+    IsADirectoryError: "a file at {}, or nothing, got a folder",
+}
+
 
 def is_resumable(words: Sequence[str]) -> bool:
     """Whether the command with these words continues where it was stopped."""
@@ -76,6 +83,10 @@ def text_for_people(error: Exception) -> str | None:
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         where = f" of {error.filename}" if error.filename else ""
         return f"the disk{where} is full: free some space or choose another folder. Finished work is kept"
+    if isinstance(error, OSError) and not isinstance(error, AdvnerfError) and error.filename:
+        for kind, wanted in _IN_THE_WAY.items():
+            if isinstance(error, kind):
+                return f"expected {wanted.format(error.filename)}; choose another name"
     if isinstance(error, AdvnerfError | OSError):
         return str(error) or type(error).__name__
     return None

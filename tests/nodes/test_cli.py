@@ -13,6 +13,7 @@ import pytest
 from nodes.bags.reader import read_info
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
+from nodes.cli.endings import text_for_people
 from nodes.launching.watching import describe
 from nodes.runtime.messages import encode, pose_message
 from tests.support.waiting import wait_for
@@ -346,3 +347,18 @@ def test_a_replay_overwrites_nothing_that_it_was_given(command, tmp_path):
     code, _, errors = command("bag", "replay", bag, "--golden", bag, "--update-golden")
     assert (code, "would be overwritten" in errors) == (2, True), errors
     assert all(file.read_text() == file.name for file in (bag, attack, policy))
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda folder: (folder / "a").mkdir(), "expected a folder at {}/a, or nothing, got a file"),
+        (lambda folder: (folder / "a/b").write_text(""), "expected folders on the way to {}/a/b, got a file"),
+        (lambda folder: folder.write_text(""), "expected a file at {}, or nothing, got a folder"),
+    ],
+)
+def test_what_is_in_the_way_of_an_output_is_told_in_one_line(tmp_path, make, told):
+    (tmp_path / "a").write_text("of the user")
+    with pytest.raises(OSError) as error:
+        make(tmp_path)
+    assert text_for_people(error.value).startswith(told.format(tmp_path))
