@@ -57,37 +57,37 @@ def _calibration_files(plan: Plan) -> Iterator[tuple[Path, type[Calibration]]]:
 
 def named(plan: Plan) -> list[CheckResult]:
     """Check that every other file exists, and that attacks fit camera and face."""
-    rows = []
-    known = {str(file) for file, _ in _calibration_files(plan)}
-    for name in plan.nodes:
-        data = plan.documents[name].data
-        rows += [
-            CheckResult(
-                "files",
-                FAILURE,
-                f"{name}: no file {value}",
-                _PATH_CURE,
-            )
-            for value in _paths(data)
-            if value not in known and not Path(value).exists()
-        ]
-        if isinstance(data, dict) and data.get("attack"):
-            rows += _attack(name, data)
-    return rows or report("files", OK, "all files that the nodes name exist")
+    return [*_absent(plan), *_attacks(plan)] or report("files", OK, "all files that the nodes name exist")
 
 
 def unusable(plan: Plan) -> list[str]:
     """The errors of calibrations and attacks, without which no node starts, as one line each."""
-    return [
-        _line(row)
-        for row in (*calibrations(plan), *named(plan))
-        if row.state == FAILURE and row.check != "files"
-    ]
+    return [_line(row) for row in (*calibrations(plan), *_attacks(plan)) if row.state == FAILURE]
 
 
 def missing(plan: Plan) -> list[str]:
     """All other files that the nodes name and that do not exist, as one line each."""
-    return [_line(row) for row in named(plan) if row.state == FAILURE and row.check == "files"]
+    return [_line(row) for row in _absent(plan)]
+
+
+def _absent(plan: Plan) -> list[CheckResult]:
+    known = {str(file) for file, _ in _calibration_files(plan)}
+    return [
+        CheckResult("files", FAILURE, f"{name}: no file {value}", _PATH_CURE)
+        for name in plan.nodes
+        for value in _paths(plan.documents[name].data)
+        if value not in known and not Path(value).exists()
+    ]
+
+
+def _attacks(plan: Plan) -> list[CheckResult]:
+    """Check the attacks that nodes name."""
+    found: list[CheckResult] = []
+    for name in plan.nodes:
+        data = plan.documents[name].data
+        if isinstance(data, dict) and data.get("attack"):
+            found += _attack(name, data)
+    return found
 
 
 def _line(row: CheckResult) -> str:
