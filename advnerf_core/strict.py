@@ -28,6 +28,7 @@ from pydantic_core import CoreSchema, PydanticKnownError, SchemaValidator, core_
 
 from advnerf_core.documents import Document, Key, raise_problems
 from advnerf_core.errors import ConfigError
+from advnerf_core.unit_bounds import MOST_LAG_S, MOST_LENGTH_M, MOST_SPEED_MPS
 
 # Types of pydantic errors whose message includes the input.
 COMPLETE = "complete"
@@ -143,12 +144,11 @@ def within_a_turn(angle_rad: float) -> float:
 Angle = Annotated[float, AfterValidator(within_a_turn)]
 """An angle [rad]; degrees are refused where they are more than a turn."""
 
-# Bounds that only another unit exceeds: no car, lens or test track comes near them.
-LengthM = Annotated[float, at_most(20.0, "m", "cm or mm")]
-SpeedMps = Annotated[float, at_most(50.0, "m/s", "km/h or mm/s")]
+LengthM = Annotated[float, at_most(MOST_LENGTH_M, "m", "cm or mm")]
+SpeedMps = Annotated[float, at_most(MOST_SPEED_MPS, "m/s", "km/h or mm/s")]
 RightAngleRad = Annotated[float, at_most(0.5 * math.pi, "rad", "degrees")]
 AngularRate = Annotated[float, at_most(100.0, "rad/s", "degrees/s")]
-LagS = Annotated[float, at_most(5.0, "s", "ms")]
+LagS = Annotated[float, at_most(MOST_LAG_S, "s", "ms")]
 
 
 def validate(model: type[M], document: Document, folder: Path | None = None) -> M:

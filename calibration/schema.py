@@ -30,6 +30,7 @@ from advnerf_core.strict import (
     validate,
     within_a_turn,
 )
+from advnerf_core.unit_bounds import MOST_LENGTH_M
 from calibration.fence import inside, require_simple
 from hardware.motor.limits import DriveLimits, VehicleGains
 
@@ -38,7 +39,7 @@ Point3 = tuple[float, float, float]
 Point2 = tuple[float, float]
 _RIGID_TOLERANCE = 1e-6
 _PLANAR_TOLERANCE_M = 0.005
-_LARGEST_MOUNT_M, _LARGEST_FACE_M = 20.0, 50.0
+_LARGEST_FACE_M = 50.0
 _OPTIONAL = ("views", "residuals", "response")
 
 
@@ -127,9 +128,9 @@ class CameraCalibration(Intrinsics):
     @field_validator("T_car_from_camera")
     @classmethod
     def _rigid(cls, rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
-        if max(abs(row[3]) for row in rows) > _LARGEST_MOUNT_M:
+        if max(abs(row[3]) for row in rows) > MOST_LENGTH_M:
             raise ValueError(
-                f"expected a camera at most {_LARGEST_MOUNT_M:g} m from the rear axle; is it in cm or mm?"
+                f"expected a camera at most {MOST_LENGTH_M:g} m from the rear axle; is it in cm or mm?"
             )
         return require_rigid(rows)
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from advnerf_core.policies.driver import Driver
+from advnerf_core.policies.driver import Driver, require_goal
 from advnerf_core.policies.load import load_driver
 from advnerf_core.strict import StrictModel
 from nodes.runtime.clock import NS_PER_S
@@ -87,10 +87,7 @@ class CounterfactualNode(Node):
             raise ConfigError(
                 f"expected the same policy twice, got {clean.sha256[:12]} and {attacked.sha256[:12]}"
             )
-        if len(config.goal) != clean.goal_size:
-            raise ConfigError(
-                f"expected a goal of {clean.goal_size} numbers for this policy, got {len(config.goal)}; set 'goal'"
-            )
+        require_goal(config.goal, clean.goal_size, "set 'goal'")
         self.subscriptions = (config.clean_topic, _ATTACKED, _LABEL)
         # A queue, because the two images and the label of a stamp arrive one after the other.
         self.queues = dict.fromkeys(self.subscriptions, _QUEUE)

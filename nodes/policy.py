@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from advnerf_core.policies.driver import Driver
+from advnerf_core.policies.driver import Driver, require_goal
 from advnerf_core.policies.load import load_driver
 from advnerf_core.strict import StrictModel
 from nodes.runtime.clock import NS_PER_S
@@ -63,10 +63,7 @@ class PolicyNode(Node):
     tick_rate_hz = 10.0
 
     def __init__(self, config: PolicyNodeConfig, driver: Driver) -> None:
-        if len(config.goal) != driver.goal_size:
-            raise ConfigError(
-                f"expected a goal of {driver.goal_size} numbers for this policy, got {len(config.goal)}; set 'goal'"
-            )
+        require_goal(config.goal, driver.goal_size, "set 'goal'")
         if config.planned_speed and driver.contract.trajectory is None:
             raise ConfigError(
                 "expected a policy that answers with waypoints for planned_speed, got one that steers; leave planned_speed out"

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.errors import ConfigError
 from advnerf_core.policies.answer import answer, memory_before
 from advnerf_core.policies.contract import PolicyContract
+
+
+def require_goal(goal: Sequence[float], size: int, advice: str) -> None:
+    """Raise a `ConfigError`, which ends with ``advice``, unless a goal has as many numbers as the policy takes."""
+    if len(goal) != size:
+        raise ConfigError(f"expected a goal of {size} numbers for this policy, got {len(goal)}; {advice}")
 
 
 class Driver:

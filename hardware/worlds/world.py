@@ -20,12 +20,14 @@ from numpy.typing import ArrayLike, NDArray
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole, VehicleState
 from advnerf_core.plain import Numbers, PlainData
+from advnerf_core.unit_bounds import MOST_LENGTH_M, MOST_SPEED_MPS
 from hardware.worlds.footprints import Footprint
 from hardware.worlds.paths import ReferencePath
 
 Rgb = NDArray[np.uint8]
 Depth = NDArray[np.float32]
 Vector3 = tuple[float, float, float]
+_MOST_TURN_RADPS = 20.0
 View = tuple[Rgb, Depth | None]
 """Colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None where depth was not wanted."""
 
@@ -71,10 +73,10 @@ class CarDescription(PlainData):
 
     def _require_units(self) -> None:
         """Raise for numbers that no car has, and that a car has in other units."""
-        most_control = 0.5 * np.pi if self.kind == "ackermann" else 20.0
+        most_control = 0.5 * np.pi if self.kind == "ackermann" else _MOST_TURN_RADPS
         for name, value, most, unit, mistaken in (
-            ("speed_mps", self.speed_mps, 50.0, "m/s", "km/h or mm/s"),
-            ("wheelbase_m", self.wheelbase_m or 0.0, 20.0, "m", "cm or mm"),
+            ("speed_mps", self.speed_mps, MOST_SPEED_MPS, "m/s", "km/h or mm/s"),
+            ("wheelbase_m", self.wheelbase_m or 0.0, MOST_LENGTH_M, "m", "cm or mm"),
             ("control_limits", self.largest_control, most_control, self.control_unit, "degrees"),
         ):
             if value > most:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from advnerf_core.unit_bounds import MOST_LENGTH_M, MOST_SPEED_MPS
 from nodes.cli.endings import INTERRUPTED, text_for_people
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.errors import ConfigError
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 USAGE_EXIT, FAULT_EXIT, CANNOT_JUDGE_EXIT = 64, 70, 2
 _PLACE, _SEARCH, _RESULT = "Place", "Search", "Result"
 _UNITS_MIN = {"s": 1 / 60, "m": 1.0, "h": 60.0}
-_WIDEST_M = 20.0
 OFF_LANE = "off-lane"
 
 
@@ -76,7 +76,7 @@ class PlaceOptions:
             _PLACE,
             "--speed",
             min=0.01,
-            max=50.0,
+            max=MOST_SPEED_MPS,
             help="Speed of the drives in m/s.",
             show_default="the car's",
         ),
@@ -84,7 +84,11 @@ class PlaceOptions:
     camera_height_m: Annotated[
         float | None,
         _option(
-            _PLACE, "--camera-height", min=0.01, max=20.0, help="Height of the driving camera in metres."
+            _PLACE,
+            "--camera-height",
+            min=0.01,
+            max=MOST_LENGTH_M,
+            help="Height of the driving camera in metres.",
         ),
     ] = None
     path: Annotated[
@@ -215,9 +219,9 @@ def _limit_m(options: PlaceOptions) -> float | None:
         value = float(text)
     except ValueError:
         value = -1.0
-    if not 0.0 < value <= _WIDEST_M:
+    if not 0.0 < value <= MOST_LENGTH_M:
         raise ConfigError(
-            f"--limit: expected metres above 0 and at most {_WIDEST_M:g}, not cm or mm, or {OFF_LANE} with a world, which declares its lanes, got {text!r}"
+            f"--limit: expected metres above 0 and at most {MOST_LENGTH_M:g}, not cm or mm, or {OFF_LANE} with a world, which declares its lanes, got {text!r}"
         )
     return value
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from advnerf_core.unit_bounds import MOST_LENGTH_M
 from nodes.cli import calibrate_display as cli_calibrate_display
 from nodes.cli import calibrate_printer as cli_calibrate_printer
 from nodes.cli.calibrate_display import Output
@@ -225,7 +226,9 @@ def vehicle(
     source: Source = None,
     wheelbase_m: Annotated[
         float | None,
-        typer.Option("--wheelbase", min=0.05, max=20.0, help="By ruler [m].", show_default="of --before"),
+        typer.Option(
+            "--wheelbase", min=0.05, max=MOST_LENGTH_M, help="By ruler [m].", show_default="of --before"
+        ),
     ] = None,
 ) -> None:
     """Calibrate speed gain, servo gain and offset, rear axle, delay and lag from circles, straight runs and steps."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from advnerf_core.unit_bounds import MOST_LAG_S, MOST_SPEED_MPS
 from nodes.cli.log_options import LogOptions, Logs
 from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import PolicyName, experiment_argument, print_table, table
@@ -45,14 +46,17 @@ class ExpertOptions:
         ),
     ] = None
     speed_mps: Annotated[
-        float, typer.Option("--speed", min=0.1, max=50.0, help="Speed at which the policy will drive [m/s].")
+        float,
+        typer.Option(
+            "--speed", min=0.1, max=MOST_SPEED_MPS, help="Speed at which the policy will drive [m/s]."
+        ),
     ] = 0.8
     delay_s: Annotated[
         float,
         typer.Option(
             "--delay",
             min=0.0,
-            max=5.0,
+            max=MOST_LAG_S,
             help="Delay from an image to the resulting wheel angle that the labels account for [s].",
         ),
     ] = 0.16
@@ -215,16 +219,23 @@ def evaluate(
     goal: Goal = None,
 ) -> None:
     """Compare the steering of a policy with logs of drives: table, plots and saliency maps."""
+    from advnerf_core.policies.driver import require_goal
     from advnerf_core.policies.load import load_any_policy
     from nodes.lab.policy_data import evaluate as measure
     from nodes.lab.policy_data.logs import open_logs
     from nodes.lab.policy_data.recordings import crop_notes, recorded_frames
+    from nodes.runtime.errors import ConfigError
 
     loaded = load_any_policy(policy)
     goals = tuple(goal or ())
     has_gradient = bool(getattr(loaded.policy, "differentiable", True))
-    _require_fitting(loaded.policy.goal_size, goals, has_gradient or not (maps or video))
-    count = 8 * has_gradient if maps is None else maps
+    require_goal(goals, loaded.policy.goal_size, "give --goal for each number")
+    if (maps or video) and not has_gradient:
+        raise ConfigError(
+            "expected a policy with a gradient for --saliency and --video, got one without; leave them out, or give the policy that it was "
+            "exported from"
+        )
+    count = (8 if has_gradient else 0) if maps is None else maps
     opened = open_logs(logs, log_options.choice(), labels)
     expert = expert_options.expert(opened)
     folders = _folders(output, opened)
@@ -245,32 +256,20 @@ def evaluate(
     print("\n".join([*crop_notes(opened, loaded.view), *written]))
 
 
-def _require_fitting(goal_size: int, goals: tuple[float, ...], has_maps: bool) -> None:
-    from nodes.runtime.errors import ConfigError
-
-    if len(goals) != goal_size:
-        raise ConfigError(
-            f"expected a goal of {goal_size} numbers for this policy, got {len(goals)}; give --goal for each number"
-        )
-    if not has_maps:
-        raise ConfigError(
-            "expected a policy with a gradient for --saliency and --video, got one without; leave them out, or give the policy that it was "
-            "exported from"
-        )
-
-
 def _folders(output: Path | None, logs: list[OpenLog]) -> list[Path]:
     """One folder for each log; logs of the same name are numbered."""
     if output is not None and len(logs) == 1:
         return [output]
     folders: list[Path] = []
     for each in logs:
-        first = (output or Path("runs")) / f"eval_{each.log.path.resolve().parent.name}_{each.log.path.stem}"
-        names = (
-            first.with_name(f"{first.name}{ending}")
-            for ending in ("", *(f"_{k}" for k in range(2, len(logs) + 1)))
-        )
-        folders.append(next(name for name in names if name not in folders))
+        folder = first = (
+            output or Path("runs")
+        ) / f"eval_{each.log.path.resolve().parent.name}_{each.log.path.stem}"
+        number = 1
+        while folder in folders:
+            number += 1
+            folder = first.with_name(f"{first.name}_{number}")
+        folders.append(folder)
     return folders
 
 

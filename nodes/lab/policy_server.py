@@ -27,7 +27,7 @@ from carla_driver_interface.protocol import (
 from carla_driver_interface.service import EgodriverServicer, ServiceMode
 from numpy.typing import NDArray
 
-from advnerf_core.policies.driver import Driver
+from advnerf_core.policies.driver import Driver, require_goal
 from nodes.linking.keys import is_loopback
 from nodes.operator_page.certificate import certificate
 from nodes.runtime.errors import ConfigError
@@ -70,10 +70,7 @@ class ServedPolicy(BaseDriver):
             raise ConfigError(
                 "expected a wheelbase for a policy that answers with wheel angles; give --wheelbase of the car that it was trained for"
             )
-        if len(car.goal) != driver.goal_size:
-            raise ConfigError(
-                f"expected a goal of {driver.goal_size} numbers for this policy, got {len(car.goal)}; give --goal"
-            )
+        require_goal(car.goal, driver.goal_size, "give --goal")
         self.name = f"{name}-{driver.sha256[:12]}"
         self._driver, self._car = driver, car
         self._sessions: dict[str, tuple[str, Driver]] = {}

@@ -52,9 +52,8 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     for remark in training.remarks:
         print(remark)
     images = training.load(request.size)
-    compared = held_out.load(
-        request.size
-    )  # now, so that an image that cannot be compared is an error at once
+    # Now, so that an image that cannot be compared is an error at once.
+    compared = held_out.load(request.size)
     field = scene_field(request, training, images)
     march = sample_intervals(request, field, images)
     print(_described(request, field, march))

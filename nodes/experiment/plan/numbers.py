@@ -4,10 +4,11 @@ from typing import Annotated
 
 from pydantic import Field
 
+from advnerf_core.strict import LagS
+
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]
-# Of a steering's response: above this, seconds were meant to be milliseconds.
-Delay = Annotated[float, Field(ge=0, le=5)]
+Delay = Annotated[LagS, Field(ge=0)]

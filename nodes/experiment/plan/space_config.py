@@ -32,8 +32,8 @@ class PlacesConfig(StrictModel):
     steps: Positive = Field(default=10, description="Evaluations of each placement.")
     move_m: NotNegative = Field(default=1.5, description="An object's x and y may change by this [m].")
     turn_rad: Angle = Field(
-        ge=0.0,
         default=0.6,
+        ge=0.0,
         description="A car's heading may change by this [rad]; a hydrant may turn all the way round.",
     )
     pose_rate: PositiveNumber = Field(

@@ -162,9 +162,8 @@ def _shard(digest: str) -> str:
 
 def _digest_of(opened: OpenLog) -> str:
     """Digest of a log's files and options. Where sizes or times of files change, it counts as another log."""
-    stats = [
-        (file.name, file.stat()) for file in opened.log.files if file.exists()
-    ]  # what is missing is told when it is read
+    # What is missing is told when it is read.
+    stats = [(file.name, file.stat()) for file in opened.log.files if file.exists()]
     files = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     return _digest([opened.name, files, {**asdict(opened.choice), "labels": opened.labels}])
 
