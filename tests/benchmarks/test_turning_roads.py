@@ -15,17 +15,21 @@ def turn_of(*segments: Segment) -> float | None:
     return missable_turn_m(ReferencePath((0.0, 0.0, 0.0), segments), HALF_LANE_M, 12.0)
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_sharp_turn_begins_where_its_arcs_do(side: float) -> None:
-    assert turn_of(("line", 50.0), ("arc", 10.0, side * RIGHT_ANGLE), ("line", 30.0)) == 50.0
-    halves: tuple[Segment, ...] = (("arc", 10.0, side * 0.6), ("arc", 12.0, side * 0.6))
+def test_a_sharp_turn_to_the_right_begins_where_its_arcs_do() -> None:
+    assert turn_of(("line", 50.0), ("arc", 10.0, -RIGHT_ANGLE), ("line", 30.0)) == 50.0
+    halves: tuple[Segment, ...] = (("arc", 10.0, -0.6), ("arc", 12.0, -0.6))
     assert turn_of(("line", 50.0), *halves, ("line", 30.0)) == 50.0
-    gentle: Segment = ("arc", 40.0, side * 1.0)
+    gentle: Segment = ("arc", 40.0, -1.0)
     assert turn_of(("line", 20.0), gentle, *halves, ("line", 30.0)) == pytest.approx(60.0)
 
 
 def test_what_cannot_be_missed_is_none() -> None:
     assert turn_of(("line", 100.0)) is None
-    assert turn_of(("line", 50.0), ("arc", 40.0, RIGHT_ANGLE), ("line", 30.0)) is None  # gentle
+    assert turn_of(("line", 50.0), ("arc", 40.0, -RIGHT_ANGLE), ("line", 30.0)) is None  # gentle
     assert turn_of(("line", 50.0), ("arc", 10.0, 0.6), ("arc", 10.0, -0.6), ("line", 30.0)) is None  # a bend
-    assert turn_of(("line", 50.0), ("arc", 10.0, RIGHT_ANGLE), ("line", 11.0)) is None  # no way behind it
+    assert turn_of(("line", 50.0), ("arc", 10.0, -RIGHT_ANGLE), ("line", 11.0)) is None  # no way behind it
+
+
+def test_a_road_that_turns_left_first_is_not_taken() -> None:
+    right: Segment = ("arc", 10.0, -RIGHT_ANGLE)
+    assert turn_of(("line", 50.0), ("arc", 20.5, RIGHT_ANGLE), ("line", 50.0), right, ("line", 30.0)) is None
