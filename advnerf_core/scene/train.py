@@ -131,6 +131,8 @@ class Trainer:
                 "expected pixels to learn from, the masks leave none: are they the right way round?"
             )
         self._fingerprint = training_fingerprint(images, field_config, self.config, self.march)
+        # Not in the fingerprint, so that checkpoints of earlier versions, which lack it, can still be resumed.
+        self._cameras = hashlib.sha256(self._intrinsics.tobytes()).hexdigest()
         self._leaps: Leaps | None = None
         self._recent: list[StepResult] = []
 
@@ -220,6 +222,7 @@ class Trainer:
             "rays_per_step": self.rays_per_step,
             "history": self.history,
             "fingerprint": self._fingerprint,
+            "cameras": self._cameras,
         }
         write_atomically(path, save_arrays(tensors, {"state": json.dumps(state)}))
 
@@ -236,7 +239,8 @@ class Trainer:
             raise CheckpointError(
                 f"expected a training checkpoint at {path}, got: {error!r}; delete it to train from the start"
             ) from error
-        if state["fingerprint"] != self._fingerprint:
+        same_cameras = state.get("cameras", self._cameras) == self._cameras
+        if state["fingerprint"] != self._fingerprint or not same_cameras:
             raise CheckpointError(
                 f"expected a checkpoint of these images and settings at {path}, got one of others; delete it to train anew"
             )

@@ -131,6 +131,15 @@ def test_unusable_checkpoints_are_refused_with_the_way_out(tmp_path: Path) -> No
         Trainer(images, FIELD, dataclasses.replace(TRAIN, seed=1)).restore(path)
 
 
+def test_a_checkpoint_of_cameras_with_other_intrinsics_is_refused(tmp_path: Path) -> None:
+    images, path = room_images(3), tmp_path / "checkpoint.safetensors"
+    Trainer(images, FIELD, TRAIN).save(path)
+    corrected = tuple(dataclasses.replace(each, cx=each.cx + 4.0) for each in images.pinholes)
+    with pytest.raises(CheckpointError, match="one of others"):
+        Trainer(dataclasses.replace(images, pinholes=corrected), FIELD, TRAIN).restore(path)
+    Trainer(images, FIELD, TRAIN).restore(path)
+
+
 def test_time_limit_ends_a_training() -> None:
     trainer = Trainer(room_images(3), FIELD, dataclasses.replace(TRAIN, steps=10**6, max_seconds=0.3))
     trainer.run()
