@@ -32,7 +32,7 @@ from calibration.scans.scan import (
     pose_of,
 )
 from calibration.scans.timed_images import TimedImage, place_images
-from calibration.scans.trajectory import Trajectory, trajectory_of
+from calibration.scans.trajectory import Trajectory, require_order, trajectory_of
 from calibration.schema import CameraCalibration, load_calibration
 
 OPTIONS = ("images", "calibration")
@@ -52,6 +52,7 @@ def read(path: Path, options: ScanOptions) -> Scan:
     trajectory = _trajectory(root)
     found, left_out, pictures = list[Registered](), list[LeftOut](), dict[str, Picture]()
     cameras = sorted(each.parent for each in root.glob("cam*/data.csv"))
+    _require_one_camera(root, cameras, options)
     share = max((options.most or MOST_OF_RECORDING) // len(cameras), 1)
     for camera in cameras:
         sensor = _sensor(camera)
@@ -72,6 +73,16 @@ def read(path: Path, options: ScanOptions) -> Scan:
     return Scan(model_of(found, left_out, path), pictures, unit, True, np.eye(3), facts=facts)
 
 
+def _require_one_camera(root: Path, cameras: Sequence[Path], options: ScanOptions) -> None:
+    """Refuse options that would give several cameras one folder of images, whose names they share, or one lens."""
+    given = [f"--{name}" for name in OPTIONS if getattr(options, name) is not None]
+    if given and len(cameras) > 1:
+        raise ScanError(
+            f"{root}: expected {' and '.join(given)} for a recording of one camera, got {', '.join(each.name for each in cameras)}; "
+            "leave the option out, or give a copy of the recording without the other cameras"
+        )
+
+
 def _trajectory(root: Path) -> Trajectory:
     files = [root / name / "data.csv" for name in _POSES if (root / name / "data.csv").is_file()]
     if not files:
@@ -82,6 +93,7 @@ def _trajectory(root: Path) -> Trajectory:
         )
     file = files[0]
     rows = read_csv(file)
+    require_order(list(rows[0].values)[1:_POSE_COLUMNS] if rows else (), "xyzwxyz", file)
     stamps, values = list[int](), list[list[float]]()
     for row in rows:
         texts = list(row.values.values())

@@ -87,6 +87,24 @@ def trajectory_of(stamps_ns: Sequence[int], values: Array, file: Path) -> Trajec
     )
 
 
+def require_order(names: Sequence[str], axes: str, file: Path) -> None:
+    """Refuse a trajectory whose header names its columns in another order, such as ``qx qy qz qw`` for ``qw qx qy qz``.
+
+    Args:
+        names: Names of the columns of position and quaternion.
+        axes: The expected last letters of these names, such as ``xyzwxyz``. A header with other letters says nothing.
+
+    Raises:
+        ScanError: The order is another.
+    """
+    got = "".join(name.partition("[")[0].strip()[-1:].lower() for name in names)
+    if got != axes and sorted(got) == sorted(axes):
+        raise ScanError(
+            f"{file}: expected columns of a position and a quaternion in the order {', '.join(axes)}, got {', '.join(map(str.strip, names))}; "
+            "export the trajectory again in that order"
+        )
+
+
 def stamp_ns(seconds: float, where: str) -> int:
     """A time in nanoseconds.
 

@@ -21,7 +21,7 @@ from advnerf_core.geometry import Array, Pinhole
 from calibration.scans.depth import DepthView, depth_points
 from calibration.scans.scan import Scan, ScanError, ScanOptions, images_in, lens_of, model_of, pinhole_of
 from calibration.scans.timed_images import Placed, TimedImage, place_images
-from calibration.scans.trajectory import Trajectory, stamp_ns, trajectory_of
+from calibration.scans.trajectory import Trajectory, require_order, stamp_ns, trajectory_of
 from calibration.schema import CameraCalibration, load_calibration
 
 OPTIONS = ("images", "calibration")
@@ -70,6 +70,9 @@ def _trajectory(path: Path) -> Trajectory:
         raise ScanError(
             f"{files[0]}: expected rows timestamp tx ty tz qx qy qz qw, got {rows.shape[1]} columns; export the trajectory again"
         )
+    for line in read_text(files[0]).splitlines():
+        if line.startswith("#") and len(names := line.strip("# ").replace(",", " ").split()) == 8:
+            require_order(names[1:], "xyzxyzw", files[0])
     stamps = [stamp_ns(float(each), str(files[0])) for each in rows[:, 0]]
     return trajectory_of(stamps, rows[:, 1:], files[0])
 
@@ -99,9 +102,11 @@ def _timed(path: Path, options: ScanOptions) -> list[TimedImage]:
 
 
 def _stamp_of_name(file: Path) -> int:
-    if not re.fullmatch(r"\d{1,19}(\.\d+)?", file.stem):
+    # 000123 is a frame's number: seconds have a fraction, or ten digits since 1970.
+    if not re.fullmatch(r"\d{1,19}\.\d+|[1-9]\d{9,18}", file.stem):
         raise ScanError(
-            f"{file}: expected the time stamp [s] as the name of an image, got {file.stem}; list the images in rgb.txt: timestamp file"
+            f"{file}: expected the time stamp [s] as the name of an image, such as 1305031102.1753.png, got {file.stem}; "
+            "list the images in rgb.txt: timestamp file"
         )
     return stamp_ns(float(file.stem), str(file))
 

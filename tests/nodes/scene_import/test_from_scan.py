@@ -202,6 +202,30 @@ def test_sensors_of_euroc_that_opencv_wrote(tmp_path, head):
     assert_same_pixels(frames, TRUTH, BROWN)
 
 
+def test_one_folder_of_images_or_one_lens_is_not_for_several_cameras_of_euroc(tmp_path):
+    """Both cameras would have shown the same files, as names of EuRoC are time stamps."""
+    scan = scan_samples.euroc(tmp_path / "scan")
+    given = ScanOptions(images=scan / "mav0" / "cam1" / "data", calibration=calibration(tmp_path))
+    with pytest.raises(
+        AdvnerfError, match=r"--images and --calibration for a recording of one camera, got cam0, cam1"
+    ):
+        run(tmp_path, scan, given)
+
+
+@pytest.mark.parametrize("kind", ["EuRoC", "TUM"])
+def test_a_trajectory_whose_header_names_another_order_is_refused(tmp_path, kind):
+    """ROS writes x y z w, EuRoC w x y z: turned cameras that nothing else shows."""
+    scan = scan_samples.write(kind, tmp_path / "scan")
+    file = next(scan.rglob("state_groundtruth_estimate0/data.csv" if kind == "EuRoC" else "groundtruth.txt"))
+    other = {"q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []": "qx, qy, qz, qw", "qx qy qz qw": "qw qx qy qz"}
+    text = file.read_text()
+    for ours, theirs in other.items():
+        text = text.replace(ours, theirs)
+    file.write_text(text)
+    with pytest.raises(AdvnerfError, match=r"expected columns of a position and a quaternion in the order"):
+        run(tmp_path, scan)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_training_takes_the_data_set_without_a_box(tmp_path, kind):
     run(tmp_path, scan_samples.write(kind, tmp_path / "scan"))
@@ -219,6 +243,16 @@ def test_tum(tmp_path, listed):
     frames, report = run(tmp_path, scan_samples.tum(tmp_path / "scan", listed))
     assert_same_pixels(frames, TRUTH)
     assert report["scan"] == {"format": "TUM", "rows_without_pose": 0}
+
+
+def test_numbers_of_frames_are_no_time_stamps(tmp_path):
+    scan = scan_samples.tum(tmp_path / "scan", listed=False)
+    for number, file in enumerate(sorted((scan / "rgb").iterdir())):
+        file.rename(file.with_name(f"{number:06d}.png"))
+    rows = np.loadtxt(scan / "groundtruth.txt")
+    np.savetxt(scan / "groundtruth.txt", rows - [rows[0, 0], *7 * [0.0]])
+    with pytest.raises(AdvnerfError, match=r"000000.png: expected the time stamp \[s\] as the name"):
+        run(tmp_path, scan)
 
 
 def test_a_trajectory_of_slam_has_its_own_unit_and_directions(tmp_path):
