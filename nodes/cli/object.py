@@ -24,6 +24,12 @@ ObjectPath = Annotated[
 _TURNTABLE_VIEWS, _TURNTABLE_PIXELS = 8, 240
 _HELD_OUT_EVERY, _FEWEST_TO_SPLIT = 8, 16
 _DEFAULT_STEPS, _NO_STEP_LIMIT = 600, 1_000_000
+# What each source of an object takes, beside the options of all.
+_OPTIONS_OF = {
+    "FILE": ("--height", "--up", "--unit"),
+    "--generate": ("--height",),
+    "--images": ("--minutes", "--size", "--coarse-to-fine"),
+}
 
 
 @app.command("build")
@@ -46,7 +52,9 @@ def object_build(
         typer.Option("--output", "-o", help="Object file.", show_default="<name>.object.safetensors"),
     ] = None,
     resolution: Annotated[int, typer.Option(min=8, max=128, help="Voxels along the longest side.")] = 64,
-    height_m: Annotated[float | None, typer.Option("--height", help="Scale to this height [m].")] = None,
+    height_m: Annotated[
+        float | None, typer.Option("--height", help="Scale to this height [m]. Not with --images.")
+    ] = None,
     up: Annotated[
         str | None,
         typer.Option(
@@ -100,12 +108,22 @@ def object_build(
     from nodes.runtime.errors import ConfigError
     from nodes.runtime.progress import ProgressDisplay
 
-    if sum(given is not None for given in (file, generate, images)) != 1:
+    sources = [
+        name for name, given in zip(_OPTIONS_OF, (file, generate, images), strict=True) if given is not None
+    ]
+    if len(sources) != 1:
         raise ConfigError("expected exactly one of FILE, --generate and --images")
-    if images is None and (minutes is not None or size is not None or coarse_to_fine):
-        raise ConfigError(
-            "expected --minutes, --size and --coarse-to-fine only with --images; add --images or remove them"
-        )
+    _refuse_options_of_others(
+        sources[0],
+        {
+            "--height": height_m is not None,
+            "--up": up is not None,
+            "--unit": unit is not None,
+            "--minutes": minutes is not None,
+            "--size": size is not None,
+            "--coarse-to-fine": coarse_to_fine,
+        },
+    )
     if minutes is not None and steps is not None:
         raise ConfigError("expected either --steps or --minutes, got both; remove one of them")
     name = generate or _name(file or images or Path())
@@ -187,6 +205,15 @@ def _mesh(  # type: ignore[no-untyped-def]
     if generate not in GENERATORS:
         raise ConfigError(f"expected --generate to be one of {', '.join(GENERATORS)}; got {generate!r}")
     return stand(GENERATORS[generate](), height_m=height_m), {"generator": generate}
+
+
+def _refuse_options_of_others(source: str, given: dict[str, bool]) -> None:
+    from nodes.runtime.errors import ConfigError
+
+    for name, is_given in given.items():
+        if is_given and name not in _OPTIONS_OF[source]:
+            takers = " or ".join(each for each, takes in _OPTIONS_OF.items() if name in takes)
+            raise ConfigError(f"expected {name} only with {takers}, got it with {source}; leave it out")
 
 
 def _name(source: Path) -> str:
