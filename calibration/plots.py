@@ -15,7 +15,7 @@ from calibration.camera_to_car import MountFit
 from calibration.display_colour import DisplayFit
 from calibration.intrinsics import IntrinsicsFit
 from calibration.mocap_to_scene import SceneFit
-from calibration.schema import Calibration, CalibrationError, save_calibration
+from calibration.schema import Calibration, CalibrationError, refuse_other_kinds, save_calibration
 from calibration.time_offset import OffsetFit
 from calibration.vehicle import GainsFit
 from calibration.vehicle_response import ResponseFit
@@ -29,7 +29,12 @@ def plot_beside(path: Path) -> Path:
 
 
 def save_with_plot(calibration: Calibration, path: Path, draw: Callable[[Figure], None]) -> Path:
-    """Write a calibration file and its plot, each atomically. Returns the path of the plot."""
+    """Write a calibration file and its plot, each atomically. Returns the path of the plot.
+
+    Raises:
+        CalibrationError: A file cannot be written, or would replace a file of another kind.
+    """
+    refuse_other_kinds(calibration, path)
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     draw(figure)
     buffer = BytesIO()

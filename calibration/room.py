@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from advnerf_core.driving.path import Arc, Path
 from advnerf_core.geometry import Array, invert_transform, transform_points
 from calibration.degeneracy import DegenerateDataError
-from calibration.schema import TargetCalibration
+from calibration.schema import TargetCalibration, measured
 
 _CELL_M = 0.01
 _LARGEST_ROOM_M = 50.0
@@ -102,8 +102,10 @@ def target_of_size(
         centre_m: Middle of the rectangle in the subject's frame [m].
         normal_yaw_rad: Direction of its normal, about the subject's z axis [rad]; 0 is along x.
     """
-    if min(size_m) <= 0.0:
-        raise DegenerateDataError(f"expected a width and a height > 0, got {size_m[0]:g} x {size_m[1]:g} m")
+    if not (min(size_m) > 0.0 and np.isfinite([*size_m, *centre_m, normal_yaw_rad]).all()):
+        raise DegenerateDataError(
+            f"expected a width and a height > 0, and finite numbers, got {size_m[0]:g} x {size_m[1]:g} m at {centre_m}, turned by {normal_yaw_rad:g} rad"
+        )
     # Seen from the front, left is the side of the negative y axis of the face's frame.
     right = np.array([-np.sin(normal_yaw_rad), np.cos(normal_yaw_rad), 0.0])
     up = np.array([0.0, 0.0, 1.0])
@@ -210,15 +212,14 @@ def _target(
     subject: str, corners: Array, method: str, views: int | None, residuals: dict[str, float]
 ) -> TargetCalibration:
     rows = tuple(tuple(round(float(v), 5) for v in corner) for corner in corners)
-    return TargetCalibration.model_validate(
-        {
-            "date": datetime.date.today(),
-            "method": method,
-            "subject": subject,
-            "corners_in_subject_m": rows,
-            "views": views,
-            "residuals": residuals,
-        }
+    return measured(
+        TargetCalibration,
+        date=datetime.date.today(),
+        method=method,
+        subject=subject,
+        corners_in_subject_m=rows,
+        views=views,
+        residuals=residuals,
     )
 
 

@@ -339,9 +339,34 @@ def parse_calibration(model: type[C], text: str, source: str) -> C:
         raise CalibrationError(str(error)) from None
 
 
+def refuse_other_kinds(calibration: Calibration, path: Path) -> None:
+    """Refuse to replace a file that is no calibration of the same kind, such as the measured room by a target.
+
+    Raises:
+        CalibrationError: The file is of another kind, or none of ours.
+    """
+    if not path.is_file() or path.stat().st_size == 0:
+        return
+    try:
+        found = read_yaml(path).data
+    except ConfigError:
+        found = None
+    kind = found.get("kind") if isinstance(found, dict) else None
+    if kind != calibration.kind:
+        raise CalibrationError(
+            f"expected to write a calibration of the kind {calibration.kind} to a new file or over one of this kind, got {path}, "
+            f"which is {'no calibration' if kind is None else f'of the kind {kind}'}; choose another --output"
+        )
+
+
 def save_calibration(calibration: Calibration, path: Path | str) -> None:
-    """Write a calibration file atomically."""
+    """Write a calibration file atomically.
+
+    Raises:
+        CalibrationError: The file cannot be written, or would replace a file of another kind.
+    """
     path = Path(path)
+    refuse_other_kinds(calibration, path)
     values = calibration.model_dump(mode="python")
     # Files without measurements stay as short as before.
     kept = {key: value for key, value in values.items() if key not in _OPTIONAL or value not in (None, {})}

@@ -25,6 +25,7 @@ BagFile = Annotated[Path, typer.Argument(help="Bag with the trace.", exists=True
 Topic = Annotated[str, typer.Option("--topic", help="Topic of the trace: /vicon/car or /vicon/wand.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")]
 FAILURE_EXIT = 1
+_ORIGIN = "0,0,0"
 
 
 @app.command("path")
@@ -131,14 +132,14 @@ def room_target(
     ] = None,
     centre: Annotated[
         str, typer.Option(metavar="X,Y,Z", help="Centre of the face in the subject's frame [m].")
-    ] = "0,0,0",
+    ] = _ORIGIN,
     yaw_deg: Annotated[
         float, typer.Option("--yaw", help="Direction of the face, about the subject's z axis [deg].")
     ] = 0.0,
     wand: Annotated[str, typer.Option(help="Topic of the wand.")] = "/vicon/wand",
     tip: Annotated[
         str, typer.Option(metavar="X,Y,Z", help="Tip of the wand in the wand's frame [m].")
-    ] = "0,0,0",
+    ] = _ORIGIN,
 ) -> None:
     """Measure the pose of a face in its subject's frame, with a ruler or by touching its corners with a wand.
 
@@ -155,6 +156,11 @@ def room_target(
     if (bag is None) == (size is None):
         raise CalibrationError(
             "expected either a bag in which a wand touches the corners or --face-size WxH; give one of them"
+        )
+    unused = {"--centre": centre, "--yaw": yaw_deg} if size is None else {"--tip": tip}
+    if ignored := [name for name, value in unused.items() if value not in (_ORIGIN, 0.0)]:
+        raise CalibrationError(
+            f"expected --centre and --yaw with --face-size, and --tip with a bag, got {' and '.join(ignored)} with the other; leave it out"
         )
     refuse_overwriting([bag], [output])
     if size is not None:

@@ -3,6 +3,7 @@ import pytest
 
 from advnerf_core.attack.artifact import face_texture
 from advnerf_core.driving.path import Arc, Line, Path
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole, make_transform, planar_pose, rotation_z, transform_points
 from calibration.degeneracy import DegenerateDataError
 from calibration.placement import face_frame, measured_pose, misplacement
@@ -24,6 +25,20 @@ SQUARE = Path.rounded_square(4.0, 1.1)
 def area(polygon):
     x, y = np.array(polygon).T
     return 0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
+
+
+@pytest.mark.parametrize(
+    ("size_m", "centre_m", "subject", "message"),
+    [
+        ((59.77, 33.62), (0, 0, 0), "monitor", "is it in cm or mm"),
+        ((0.6, np.inf), (0, 0, 0), "monitor", "finite numbers"),
+        ((0.6, 0.3), (0, np.nan, 0), "monitor", "finite numbers"),
+        ((0.6, 0.3), (0, 0, 0), "", "subject"),
+    ],
+)
+def test_a_face_that_cannot_be_is_an_error_of_ours(size_m, centre_m, subject, message):
+    with pytest.raises(AdvnerfError, match=message):
+        target_of_size(subject, size_m, centre_m, 0.0, "ruler")
 
 
 def walk(corners, noise_m=0.003):

@@ -1,6 +1,7 @@
 """Calibration files: what is accepted, what is refused with which words, and that the shipped ones are the twin's truth."""
 
 import datetime
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -184,15 +185,38 @@ def test_missing_and_unreadable_files(tmp_path):
         load_calibration(CameraCalibration, tmp_path / "tag.yaml")
 
 
-def test_nothing_is_left_half_written(tmp_path):
-    target = TargetCalibration(
+def target_file():
+    return TargetCalibration(
         date=datetime.date(2026, 1, 2),
         method="ruler",
         subject="sign",
         corners_in_subject_m=((0, 0, 1), (0, 1, 1), (0, 1, 0), (0, 0, 0)),
     )
+
+
+def test_nothing_is_left_half_written(tmp_path):
+    target = target_file()
     save_calibration(target, tmp_path / "sign.yaml")
     assert load_calibration(TargetCalibration, tmp_path / "sign.yaml") == target
     with pytest.raises(CalibrationError, match="cannot write"):
         save_calibration(target, tmp_path / "sign.yaml" / "sign.yaml")
     assert [p.name for p in tmp_path.iterdir()] == ["sign.yaml"]
+
+
+def test_a_calibration_replaces_only_its_own_kind(tmp_path):
+    target, room = target_file(), tmp_path / "room.yaml"
+    shutil.copy(SHIPPED / "room.yaml", room)
+    (tmp_path / "my.experiment.yaml").write_text("place: {world: {kind: lab}}\n")
+    (tmp_path / "notes.txt").write_text("- milk: [\n")
+    for name, got in (
+        ("room.yaml", "of the kind room"),
+        ("my.experiment.yaml", "no calibration"),
+        ("notes.txt", "no calibration"),
+    ):
+        before = (tmp_path / name).read_bytes()
+        with pytest.raises(CalibrationError, match=rf"of the kind target .*{name}, which is {got}"):
+            save_calibration(target, tmp_path / name)
+        assert (tmp_path / name).read_bytes() == before
+    (tmp_path / "new.yaml").touch()
+    for _ in range(2):
+        save_calibration(target, tmp_path / "new.yaml")

@@ -22,6 +22,7 @@ from nodes.lab.room.placing import write_measured_request
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import encode, pose_message
+from tests.support.commands import advnerf as command
 from tests.support.faces import face_attack
 
 ROOT = Path(__file__).parents[2]
@@ -208,3 +209,21 @@ def test_targets_by_ruler_and_bad_options(tmp_path):
         "scene", "room", "target", "-o", tmp_path / "n.yaml", "--subject", "monitor", "--face-size", "27"
     )
     assert (done.returncode, "expected 2 numbers in metres" in done.stderr) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--face-size", "0.6x0.3", "--tip", "0,0,-0.3"), "got --tip with the other"),
+        (("{folder}", "--centre", "0,0,0.1", "--yaw", "90"), "got --centre and --yaw with the other"),
+    ],
+)
+def test_a_ruler_needs_no_wand_and_a_wand_no_ruler(tmp_path, monkeypatch, capsys, words, message):
+    """What belongs to the other way of measuring was not used, and nothing said so."""
+    output = tmp_path / "board.yaml"
+    given = [word.format(folder=tmp_path) for word in words]
+    assert (
+        command(monkeypatch, "scene", "room", "target", *given, "--subject", "board", "-o", str(output)) == 2
+    )
+    assert message in capsys.readouterr().err
+    assert not output.exists()
