@@ -40,7 +40,15 @@ def write_image(path: Path, rgb: Rgb) -> None:
 
 
 def encoded(rgb: Rgb, suffix: str, alpha: Grey | None = None) -> bytes:
-    """The content that `write_image` writes for this suffix; with opacity ``[H, W]`` if the format has it."""
+    """The content that `write_image` writes for this suffix; with opacity ``[H, W]`` if the format has it.
+
+    Raises:
+        DatasetError: No format of pictures has this suffix.
+    """
+    if not cv2.haveImageWriter(f"picture{suffix}"):
+        raise DatasetError(
+            f"expected the name of a picture to write ({', '.join(SUFFIXES)}), got one that ends in {suffix!r}; choose another name"
+        )
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix in (".jpg", ".jpeg") else []
     planes = [rgb[..., ::-1]] if alpha is None or suffix in (".jpg", ".jpeg") else [rgb[..., ::-1], alpha]
     done, data = cv2.imencode(suffix, np.ascontiguousarray(np.dstack(planes)), options)

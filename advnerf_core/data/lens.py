@@ -77,6 +77,19 @@ class Straightening:
         return np.asarray(straight, np.uint8)
 
 
+def require_size(width: int, height: int) -> None:
+    """Refuse an image size [px] that no image can have here.
+
+    Raises:
+        DatasetError: A side is not above 0, or the image is too large.
+    """
+    if min(width, height) < 1 or max(width, height) > LONGEST_PX or width * height > _MOST_PIXELS:
+        raise DatasetError(
+            f"expected an image of at most {LONGEST_PX} px a side and {_MOST_PIXELS >> 20} million in all, and at least 1 px a side, got {width} x {height}; "
+            "correct the size, or reduce the images"
+        )
+
+
 @lru_cache(maxsize=4)
 def straightening(pinhole: Pinhole, lens: Lens, keep_all: bool = False) -> Straightening:
     """Find the pinhole that replaces a lens.
@@ -89,11 +102,7 @@ def straightening(pinhole: Pinhole, lens: Lens, keep_all: bool = False) -> Strai
     Raises:
         DatasetError: The image is too large, or the coefficients fold it over itself, so that it cannot be undistorted.
     """
-    if max(pinhole.width, pinhole.height) > LONGEST_PX or pinhole.width * pinhole.height > _MOST_PIXELS:
-        raise DatasetError(
-            f"expected an image of at most {LONGEST_PX} px a side and {_MOST_PIXELS >> 20} million in all, got {pinhole.width} x {pinhole.height}; "
-            "correct the size, or reduce the images"
-        )
+    require_size(pinhole.width, pinhole.height)
     ideal = _ideal_fisheye(pinhole, lens, keep_all) if lens.fisheye else _ideal_brown(pinhole, lens, keep_all)
     if ideal is None:
         raise _cannot_be_undone(pinhole, lens)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import OPAQUE, Grey, Rgb
+from advnerf_core.data.lens import require_size
 from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.data.view_loading import LoadedView, load_view
 from advnerf_core.geometry import Array, Pinhole
@@ -155,9 +156,14 @@ class PosedImages:
         Args:
             size: ``(width, height)`` [px] to resample all images to by area averaging; None keeps the size on disk.
             keep_all: Whether undistortion keeps the whole view, with ``valid`` marking existing pixels; otherwise it crops.
+
+        Raises:
+            DatasetError: An image or the size cannot be used.
         """
         if not self.frames:
             raise DatasetError(f"expected at least one image in {self._name} to load, got none")
+        if size is not None:
+            require_size(*size)
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
             found = list(pool.map(lambda frame: _view_or_error(frame, size, keep_all), self.frames))
         views = [each for each in found if isinstance(each, LoadedView)]

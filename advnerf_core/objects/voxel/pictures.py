@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from advnerf_core.data.image_files import OPAQUE
+from advnerf_core.data.lens import require_size
 from advnerf_core.data.view_loading import LoadedView, load_view
 from advnerf_core.data.views import PosedImages
 from advnerf_core.errors import AdvnerfError
@@ -91,11 +92,13 @@ def load_pictures(listed: PosedImages, size: tuple[int, int] | None = None) -> P
 
     Raises:
         FitError: The pictures have no transparency, or differ in size.
-        DatasetError: A picture cannot be read.
+        DatasetError: A picture cannot be read, or the size cannot be used.
     """
     frames = listed.frames
     if not frames:
         raise FitError(f"expected at least one picture in {listed.file}, got none")
+    if size is not None:
+        require_size(*size)
     first = load_view(frames[0], size)
     images = np.empty((len(frames), *first.rgb.shape[:2], 4), np.uint8)
     pinholes = [first.pinhole] * len(frames)

@@ -6,8 +6,10 @@ import pytest
 
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_bytes import is_damaged
-from advnerf_core.data.image_files import image_size, read_stored
+from advnerf_core.data.image_files import image_size, read_stored, write_image
 from advnerf_core.data.transforms import load_transforms
+from advnerf_core.data.views import PosedImages
+from advnerf_core.objects.voxel.pictures import load_pictures
 
 EYE = np.eye(4).tolist()
 
@@ -127,3 +129,17 @@ def test_images_of_several_sizes_need_a_common_one(tmp_path):
     with pytest.raises(DatasetError, match=r"one size in .*transforms\.json, got .*give a size"):
         listed.load()
     assert listed.load(size=(20, 15)).rgb.shape == (2, 15, 20, 3)
+
+
+@pytest.mark.parametrize("size", [(0, 0), (-5, 7), (100_000, 100_000), (30_000, 30_000)])
+@pytest.mark.parametrize("load", [PosedImages.load, load_pictures])
+def test_impossible_sizes_to_load_are_refused(tmp_path, load, size):
+    save(tmp_path / "0.png", np.zeros((30, 40, 3), np.uint8))
+    with pytest.raises(DatasetError, match=rf"px a side .* got {size[0]} x {size[1]}; correct the size"):
+        load(load_transforms(write(tmp_path, count=1)), size)
+
+
+def test_a_picture_needs_the_name_of_one(tmp_path):
+    for name in ("sheet.txt", "sheet"):
+        with pytest.raises(DatasetError, match=r"expected the name of a picture to write \(\.png"):
+            write_image(tmp_path / name, np.zeros((3, 4, 3), np.uint8))
