@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 from collections.abc import Callable
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, get_type_hints
+
+from nodes.runtime.errors import ConfigError
 
 
 def with_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command one option or argument for each field of its dataclass parameters.
 
     A field is declared as a parameter is: ``steps: Annotated[int, typer.Option(...)] = 800``. A group of fields is replaced in the place
-    of its parameter, so that ``--help`` lists all in order.
+    of its parameter, so that ``--help`` lists all in order. Infinite numbers and NaN, which Python reads as numbers, are refused with a
+    `ConfigError`.
     """
     hints = get_type_hints(command, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
@@ -24,8 +28,12 @@ def with_groups(command: Callable[..., None]) -> Callable[..., None]:
         else:
             parameters.append(parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY))
 
+    options = {parameter.name: _option_of(parameter) for parameter in parameters}
+
     @functools.wraps(command)
     def run(**given: Any) -> None:
+        for name, value in given.items():
+            _require_finite(options[name], value)
         for name, group in groups.items():
             given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
         command(**given)
@@ -46,3 +54,20 @@ def _parameters_of(group: Any) -> list[inspect.Parameter]:
         )
         for field in fields(group)
     ]
+
+
+def _option_of(parameter: inspect.Parameter) -> str:
+    """The option as a user writes it."""
+    declared = getattr(parameter.annotation, "__metadata__", ())
+    # In an Annotated, typer keeps the first of the names as the default.
+    names = [name for each in declared for name in (each.default, *(each.param_decls or ()))]
+    usual = f"--{parameter.name.replace('_', '-')}"
+    return next((name for name in names if isinstance(name, str) and name.startswith("--")), usual)
+
+
+def _require_finite(option: str, value: Any) -> None:
+    values = value if isinstance(value, tuple) else (value,)
+    if any(isinstance(each, float) and not math.isfinite(each) for each in values):
+        raise ConfigError(
+            f"expected finite numbers for {option}, got {' '.join(map(str, values))}; correct {option}"
+        )
