@@ -97,6 +97,7 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
         raise DatasetError(f"expected a list 'frames' in {path}, got {type(listed).__name__} without entries")
     split_of, frames, missing = _listed_splits(path, content, listed), list[PosedImage](), list[Path]()
     wrong, reasons = list[DatasetError](), set[str]()
+    number_of: dict[Path, int] = {}
     for number, entry in enumerate(listed):
         try:
             name = _name_of(entry)
@@ -104,6 +105,10 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
             if image is None:
                 missing.append(path.parent / name)
                 continue
+            if (first := number_of.setdefault(image, number)) != number:
+                raise ValueError(
+                    f"file_path: expected each image once, got that of frame {first} again; remove one of the two"
+                )
             values = {**_without_other_focal_lengths(content, entry), **entry}
             frames.append(_frame(path.parent, image, values, split or split_of.get(_normal(name))))
         except ValueError as error:
@@ -319,6 +324,10 @@ def _focal_length(values: _Values, axis: str, size: int) -> float | None:
             angle = unit * _number(values, key, 0.0, positive=True)
             if angle >= math.pi:
                 raise ValueError(f"{key}: expected a field of view below a half turn, got {values[key]}")
+            if unit != 1.0 and angle < unit * math.pi:  # no lens that poses were found for is so long
+                raise ValueError(
+                    f"{key}: expected a field of view in degrees, got {values[key]}; if it is in radians, write it as camera_angle_{axis}"
+                )
             return 0.5 * size / math.tan(0.5 * angle)
     return None
 

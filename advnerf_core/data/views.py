@@ -99,7 +99,26 @@ class PosedImages:
         lines = [f"skipped, file not found: {path}" for path in self.missing]
         if self.ignored:
             lines.append(f"no effect here: the keys {', '.join(self.ignored)} of {self._name}")
+        left = [frame.path.name for frame in self.frames if frame.split is None]
+        if left and {TRAIN} < set(self.splits):
+            lines.append(
+                f"not used: {len(left)} of {len(self.frames)} images, which are in no split of {self._name}: {left[0]}, ..."
+            )
         return lines
+
+    def require_places(self) -> None:
+        """Refuse cameras that are all at one place: their images show no depth.
+
+        Raises:
+            DatasetError: There are several cameras, all at one place.
+        """
+        places = np.stack([frame.T_world_from_camera[:3, 3] for frame in self.frames])
+        if len(places) > 1 and not np.ptp(places, axis=0).any():
+            x, y, z = places[0]
+            raise DatasetError(
+                f"expected cameras at different places in {self._name}, got all {len(places)} at {x:g}, {y:g}, {z:g}; give the pose of each image, "
+                "or move the camera instead of only turning it"
+            )
 
     @property
     def splits(self) -> tuple[str, ...]:

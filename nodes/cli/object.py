@@ -236,6 +236,7 @@ def _from_images(
     from advnerf_core.objects.voxel.build import build_from_images
     from advnerf_core.objects.voxel.pictures import load_pictures
 
+    listed.require_places()
     for remark in listed.remarks:
         print(remark)
     training, held_out = _split(listed)

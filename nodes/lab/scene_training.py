@@ -48,8 +48,10 @@ _MEASURES = ("psnr_db", "gain_fitted_psnr_db", "ssim")
 
 def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     """Train, and write the scene file and the metrics on held-out images. Returns the metrics."""
-    training, held_out = load_transforms(request.transforms).training_and_held_out(request.every)
-    for remark in training.remarks:
+    listed = load_transforms(request.transforms)
+    listed.require_places()
+    training, held_out = listed.training_and_held_out(request.every)
+    for remark in listed.remarks:
         print(remark)
     images = training.load(request.size)
     # Now, so that an image that cannot be compared is an error at once.

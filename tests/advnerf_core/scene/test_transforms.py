@@ -62,6 +62,22 @@ def test_nerfstudio_lists_of_splits(tmp_path):
     assert [f.path.name for f in (*training.frames, *held_out.frames)] == ["0.png", "2.png", "3.png"]
 
 
+def test_images_in_no_split_are_told(tmp_path):
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in range(4)]
+    listed = load_transforms(write(tmp_path, frames, train_filenames=["0.png"], val_filenames=["3.png"]))
+    assert listed.remarks == [
+        f"not used: 2 of 4 images, which are in no split of {tmp_path / 'transforms.json'}: 1.png, ..."
+    ]
+    assert load_transforms(write(tmp_path, frames, val_filenames=["3.png"])).remarks == [], "all are used"
+
+
+def test_cameras_at_one_place_show_no_depth(tmp_path):
+    frames = [{"file_path": f"{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(3)]
+    with pytest.raises(DatasetError, match=r"cameras at different places .*got all 3 at 0, 0, 0"):
+        load_transforms(write(tmp_path, frames)).require_places()
+    load_transforms(write(tmp_path, frames[:1])).require_places()
+
+
 def test_without_splits_every_nth_by_name_is_held_out(tmp_path):
     frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in (3, 1, 2, 0)]
     training, held_out = load_transforms(write(tmp_path, frames)).training_and_held_out(every=2)
@@ -178,6 +194,8 @@ FRAME = r"transforms\.json: frame 1 \(1\.png\): "
         ({"w": WIDTH, "h": None}, FRAME + "w: expected both w and h, or neither, got w alone"),
         ({"cx": "middle"}, FRAME + "cx: expected a number, got 'middle'"),
         ({"mask_path": "no.png"}, FRAME + r"mask_path: expected a mask at .*no\.png"),
+        ({"file_path": "./0.png"}, r"file_path: expected each image once, got that of frame 0 again"),
+        ({"fl_x": None, "x_fov": 1.35}, FRAME + "x_fov: expected a field of view in degrees, got 1.35"),
         ({"file_path": 7}, r"transforms\.json: frame 1 \(7\): file_path: expected the name"),
     ],
 )
