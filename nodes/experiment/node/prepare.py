@@ -42,7 +42,11 @@ def prepare(experiment: Experiment, seed: int | None = None) -> Prepared:
     look_at_given(experiment)
     if stages_of(experiment):
         make_ready(experiment, console=Console(quiet=True))
+    seed = experiment.config.seeds[0] if seed is None else seed
+    return Prepared.of(experiment, make_space(experiment, None), searched_cell(experiment, seed))
+
+
+def searched_cell(experiment: Experiment, seed: int) -> Cell:
+    """The search of a request with one seed."""
     config = experiment.config
-    seed = config.seeds[0] if seed is None else seed
-    cell = Cell.of(config.cell_paths[0], config.main_victim, config.methods[0], seed)
-    return Prepared.of(experiment, make_space(experiment, None), cell)
+    return Cell.of(config.cell_paths[0], config.main_victim, config.methods[0], seed)

@@ -14,19 +14,24 @@ from advnerf_core.attack.on_device import all_on_chosen_device, on_chosen_device
 from advnerf_core.attack.search.record import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.attack.spaces import places
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically, write_json
 from advnerf_core.places import require_utf8
 from advnerf_core.plugins import name_in_results
 from nodes.experiment.engine.telling import telling
 from nodes.experiment.node.job import REQUEST, TOGETHER_STATE, is_begun
 from nodes.experiment.node.poses import draw_found
-from nodes.experiment.node.prepare import load_request, prepare, request_text
+from nodes.experiment.node.prepare import load_request, prepare, request_text, searched_cell
 from nodes.experiment.plan.space_config import MeshShapeConfig, PlacesConfig
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import Prepared, search_settings
 from nodes.experiment.steps.attack import attack_file as make_attack_file
+from nodes.experiment.steps.shared_search import search_key
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import StageDisplay
+
+_KEY = "settings_hash"  # of a curve: that of the search
 
 
 def chosen_method(experiment: Experiment) -> tuple[Method, SearchSettings]:
@@ -88,13 +93,14 @@ def run_attack(
         The attack files, ``seed_<seed>.attack.safetensors``, each with its curve in a JSON file beside it, and of places with a picture.
 
     Raises:
-        ConfigError: The folder holds another request, or the method cannot search the requested parameters.
+        ConfigError: The folder holds another request, or results of files that have changed since, or the method cannot search the requested parameters.
         PluginError: The method's code cannot be loaded.
     """
     chosen_method(experiment)  # before anything is loaded or written
     require_utf8(folder.absolute())
     experiment = replace(experiment, folder=folder.resolve())
     keep_request(experiment)
+    look_at_given(experiment)
     if experiment.config.attack.together:
         return _run_together(experiment, display, on_evaluation, on_prepared)
     prepared, files = None, []
@@ -102,7 +108,7 @@ def run_attack(
         name = f"seed_{seed}"
         file = attack_file(folder, seed)
         files.append(file)
-        if file.exists():
+        if _is_done(experiment, seed):
             display.finish(name, 0.0, cached=True)
             continue
         prepared = prepare(experiment, seed) if prepared is None else prepared.with_seed(seed)
@@ -137,6 +143,31 @@ def kept_request(folder: Path) -> Experiment:
     return load_request(folder / REQUEST, folder=folder)
 
 
+def _is_done(experiment: Experiment, seed: int) -> bool:
+    """Whether a seed has its attack file and its curve.
+
+    Raises:
+        ConfigError: A file that the request names has changed since: the attack is of another policy, scene, object, calibration or code.
+    """
+    file = attack_file(experiment.folder, seed)
+    curve = _curve_file(file)
+    if not (file.exists() and curve.exists()):
+        return False
+    key = search_key(experiment, searched_cell(experiment, seed))
+    # Of a folder from before curves had it nothing is known.
+    if (kept := read_json(curve).get(_KEY, key)) != key:
+        raise ConfigError(
+            f"{file}: expected an attack on what the request names now ({key[:12]}), got one from before a file of its scene, policy, objects, "
+            f"calibration or code changed ({kept[:12]}); choose another folder, or delete the file to search again"
+        )
+    return True
+
+
+def _curve_file(file: Path) -> Path:
+    """Path of the curve beside an attack file."""
+    return file.with_name(f"{file.name.partition('.')[0]}.json")
+
+
 def _run_seed(prepared: Prepared, display: StageDisplay, on_evaluation: OnEvaluation | None) -> None:
     name = f"seed_{prepared.seed}"
     state_path = prepared.experiment.folder / f"{name}.state.safetensors"
@@ -164,7 +195,7 @@ def _run_together(
         experiment.folder / TOGETHER_STATE,
     )
     files = [attack_file(experiment.folder, seed) for seed in seeds]
-    if all(file.exists() for file in files):
+    if all([_is_done(experiment, seed) for seed in seeds]):
         for seed in seeds:
             display.finish(f"seed_{seed}", 0.0, cached=True)
         return files
@@ -209,6 +240,7 @@ def _keep(prepared: Prepared, result: SearchResult) -> None:
         "attack_id": attack.attack_id,
         "method": attack.method,
         "seed": prepared.seed,
+        _KEY: prepared.settings_hash,
         "best_evaluation": result.best.iteration,
         "loss_m": [e.loss_m for e in result.history],
         "predicted_total_cte_m": [e.predicted_total_cte_m for e in result.history],
@@ -219,7 +251,7 @@ def _keep(prepared: Prepared, result: SearchResult) -> None:
     }
     if isinstance(prepared.space, places.PlaceSpace):
         write_atomically(file.with_name(f"seed_{prepared.seed}.poses.png"), draw_found(prepared, attack))
-    write_json(file.with_name(f"seed_{prepared.seed}.json"), curve)
+    write_json(_curve_file(file), curve)
     save_attack(file, attack)
 
 

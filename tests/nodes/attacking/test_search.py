@@ -15,6 +15,7 @@ from advnerf_core.attack.search.black_box import BudgetError
 from advnerf_core.display import DisplayModel
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.onnx_policy import export_onnx
+from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import load_policy, save_policy
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import save_calibration
@@ -70,6 +71,31 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
     assert len(json.loads((tmp_path / "whole" / "seed_0.json").read_text())["loss_m"]) == 3
     with pytest.raises(ConfigError, match="belongs to another attack"):
         run_attack(loaded(file), tmp_path / "whole", ProgressDisplay())
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_a_finished_seed_of_a_policy_that_has_changed_since_is_refused(tmp_path, together):
+    file, folder = tiny_request(tmp_path, evaluations=1), tmp_path / "out"
+    request = loaded(file, [f"attack.together={str(together).lower()}"])
+    (found,) = run_attack(request, folder, ProgressDisplay())
+    before = found.read_bytes()
+    torch.manual_seed(1)
+    old = load_policy(tmp_path / "policy.safetensors")
+    save_policy(tmp_path / "policy.safetensors", PilotNet().eval(), old.view, {})
+    with pytest.raises(ConfigError, match="choose another folder, or delete the file"):
+        run_attack(loaded(file, [f"attack.together={str(together).lower()}"]), folder, ProgressDisplay())
+    assert found.read_bytes() == before
+    found.unlink()
+    run_attack(loaded(file, [f"attack.together={str(together).lower()}"]), folder, ProgressDisplay())
+    assert load_attack(found).policy_sha256 == load_policy(tmp_path / "policy.safetensors").sha256
+
+
+def test_a_seed_without_its_curve_is_searched_again(tmp_path):
+    request = loaded(tiny_request(tmp_path, evaluations=1))
+    (found,) = run_attack(request, tmp_path / "out", ProgressDisplay())
+    (curve := tmp_path / "out" / "seed_0.json").unlink()
+    assert run_attack(request, tmp_path / "out", ProgressDisplay()) == [found]
+    assert curve.exists()
 
 
 def test_a_request_that_failed_to_load_does_not_lock_its_folder(tmp_path, monkeypatch, capsys):
