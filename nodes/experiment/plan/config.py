@@ -16,7 +16,7 @@ from nodes.experiment.plan import rules
 from nodes.experiment.plan.carriers import CarrierConfig, ComposedConfig, FaceCarrier
 from nodes.experiment.plan.deploy_config import DeployConfig
 from nodes.experiment.plan.maps_config import MapsConfig
-from nodes.experiment.plan.numbers import Positive, PositiveNumber
+from nodes.experiment.plan.numbers import Length, Positive, PositiveNumber
 from nodes.experiment.plan.over import OverConfig
 from nodes.experiment.plan.placed import WantedObject
 from nodes.experiment.plan.sections import (
@@ -62,7 +62,7 @@ class ExperimentConfig(StrictModel):
         le=2.0,
         description="Control tick [s]; the paper's CARLA runs have finer ones: docs/intersection.md.",
     )
-    held_cap_m: PositiveNumber = Field(
+    held_cap_m: Length = Field(
         default=6.0, description="Largest |CTE| that a stopped car is charged per tick [m]."
     )
     capture: CaptureConfig = CaptureConfig()

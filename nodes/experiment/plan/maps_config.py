@@ -6,10 +6,10 @@ from typing import Annotated
 
 from pydantic import Field
 
-from advnerf_core.strict import Angle, StrictModel
+from advnerf_core.strict import Angle, LengthM, StrictModel
 from nodes.experiment.plan.numbers import Count, Positive
 
-Numbers = Annotated[tuple[float, ...], Field(min_length=1)]
+Lengths = Annotated[tuple[LengthM, ...], Field(min_length=1)]
 Angles = Annotated[tuple[Angle, ...], Field(min_length=1)]
 
 
@@ -25,13 +25,13 @@ class LandscapeConfig(StrictModel):
 class RobustnessMapConfig(StrictModel):
     """Starts and moves of an object; the map has every start with every move."""
 
-    sideways_m: Numbers = Field(
+    sideways_m: Lengths = Field(
         default=(-0.6, -0.3, 0.0, 0.3, 0.6), description="Starts: to the left of the first one [m]."
     )
     turn_rad: Angles = Field(
         default=(0.0,), description="Starts: turned to the left [rad]; each with each sideways."
     )
-    object_moves_m: tuple[tuple[float, float], ...] = Field(
+    object_moves_m: tuple[tuple[LengthM, LengthM], ...] = Field(
         default=((0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)),
         min_length=1,
         description="Moves of the object along x and y [m].",

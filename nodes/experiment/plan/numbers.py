@@ -4,11 +4,13 @@ from typing import Annotated
 
 from pydantic import Field
 
-from advnerf_core.strict import LagS
+from advnerf_core.strict import LagS, LengthM
 
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]
+Length = Annotated[LengthM, Field(gt=0)]
+Distance = Annotated[LengthM, Field(ge=0)]
 Delay = Annotated[LagS, Field(ge=0)]

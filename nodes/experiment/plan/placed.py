@@ -14,7 +14,7 @@ from advnerf_core.geometry import Array, make_transform, rotation_x, rotation_y,
 from advnerf_core.strict import Angle, StrictModel
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import WorldDescription
-from nodes.experiment.plan.numbers import PositiveNumber, Unit
+from nodes.experiment.plan.numbers import Length, Unit
 from nodes.experiment.plan.object_kinds import (
     BALL,
     CUBE,
@@ -47,7 +47,7 @@ class PoseBoundsConfig(StrictModel):
 
     x_m: Interval | None = None
     y_m: Interval | None = None
-    yaw_rad: Interval | None = None
+    yaw_rad: tuple[Angle, Angle] | None = None
     scale: Interval | None = None
 
     @field_validator("x_m", "y_m", "yaw_rad", "scale")
@@ -71,7 +71,7 @@ class FaceConfig(StrictModel):
         display_cos: Mean cosine, over a drive, of the angle at which the camera sees the monitor.
     """
 
-    size_m: PositiveNumber = 2.0
+    size_m: Length = 2.0
     resolution: Annotated[int, Field(ge=2, le=128)] | None = None
     rgb: tuple[Unit, Unit, Unit] | None = None
     target: NamedFile | None = None
@@ -94,7 +94,7 @@ class MeshConfig(StrictModel):
     texels: Annotated[int, Field(ge=2, le=512)] = 32
     up: Literal["z", "y"] | None = None
     unit: Literal["mm", "cm", "m", "in"] | None = None
-    height_m: PositiveNumber | None = None
+    height_m: Length | None = None
     rgb: tuple[Unit, Unit, Unit] = (0.75, 0.1, 0.08)
 
 

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from pydantic import Field
 
-from advnerf_core.strict import RightAngleRad, StrictModel
-from nodes.experiment.plan.numbers import NotNegative, Positive
+from advnerf_core.strict import RightAngleRad, StrictModel, at_most
+from nodes.experiment.plan.numbers import NotNegative, Positive, Unit
 
 
 class RobustnessConfig(StrictModel):
     """Disturbances that the attack must withstand: the loss is an expectation over these, with new draws in every evaluation."""
 
-    noise: NotNegative = Field(default=0.0, description="Pixel noise, standard deviation in 0..1.")
-    gain: NotNegative = Field(default=0.0, description="Spread of the logarithm of the exposure of a drive.")
-    brightness: NotNegative = Field(
-        default=0.0, description="Spread of a drive's additive brightness, in 0..1."
-    )
-    jitter_m: NotNegative = Field(
-        default=0.0, description="Spread of the camera's position in each frame [m]."
+    noise: Unit = Field(default=0.0, description="Pixel noise, standard deviation in 0..1.")
+    gain: Unit = Field(default=0.0, description="Spread of the logarithm of the exposure of a drive.")
+    brightness: Unit = Field(default=0.0, description="Spread of a drive's additive brightness, in 0..1.")
+    jitter_m: Annotated[float, at_most(1.0, "m", "cm or mm")] = Field(
+        default=0.0, ge=0.0, description="Spread of the camera's position in each frame [m]."
     )
     jitter_rad: RightAngleRad = Field(
         default=0.0, ge=0.0, description="Spread of the camera's rotation in each frame [rad]."

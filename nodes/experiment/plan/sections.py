@@ -8,9 +8,18 @@ from pydantic import Field, model_validator
 
 from advnerf_core.attack.objectives import CTE
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
-from advnerf_core.strict import Angle, RightAngleRad, StrictModel
+from advnerf_core.strict import Angle, AngularRate, RightAngleRad, StrictModel
 from nodes.experiment.plan.method_names import ArchitectureReference, ObjectiveReference
-from nodes.experiment.plan.numbers import Count, Delay, NotNegative, Positive, PositiveNumber, Unit
+from nodes.experiment.plan.numbers import (
+    Count,
+    Delay,
+    Distance,
+    Length,
+    NotNegative,
+    Positive,
+    PositiveNumber,
+    Unit,
+)
 from nodes.experiment.plan.robustness_config import RobustnessConfig
 
 # Fields of the section policy that define the network; its description replaces them in keys.
@@ -52,11 +61,11 @@ class SceneConfig(StrictModel):
     refine_depth: PositiveNumber = Field(
         default=0.005, description="Optical depth from which rendering looks into a cell; see TrainConfig."
     )
-    margin_m: NotNegative = Field(
+    margin_m: Distance = Field(
         default=0.5,
         description="The learned box reaches so far beyond the world's, if that is not contracted [m].",
     )
-    near_m: PositiveNumber = Field(default=0.3, description="Nothing stands nearer to the cameras [m].")
+    near_m: Length = Field(default=0.3, description="Nothing stands nearer to the cameras [m].")
     interval_px: PositiveNumber | None = Field(
         default=None,
         description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
@@ -103,7 +112,7 @@ class PolicyConfig(StrictModel):
         default=0.1,
         description="What the expert looks ahead by: half a tick and part of the deployed car's lag [s].",
     )
-    smoothing_m: PositiveNumber | None = Field(
+    smoothing_m: Length | None = Field(
         default=None,
         description="The expert averages the path's curvature over this [m]; none: the way of one tick.",
     )
@@ -229,8 +238,8 @@ class ResponseConfig(StrictModel):
 
     delay_s: Delay = Field(default=0.0, description="From image to wheels, fractions of a tick allowed [s].")
     lag_s: Delay = Field(default=0.0, description="Time constant of the steering [s].")
-    slew_radps: PositiveNumber | None = Field(
-        default=None, description="Limit of the wheels' rate [rad/s]; none: no limit."
+    slew_radps: AngularRate | None = Field(
+        default=None, gt=0.0, description="Limit of the wheels' rate [rad/s]; none: no limit."
     )
 
 
@@ -255,7 +264,7 @@ class AttackConfig(StrictModel):
     nominal_start: bool = Field(
         default=False, description="The first start of every seed is the nominal one, not of seed 0 alone."
     )
-    start_sigma: NotNegative = Field(
+    start_sigma: Distance = Field(
         default=0.1, description="Spread of starts [m and rad]; headings a quarter of it."
     )
     start_poses: tuple[tuple[float, float, Angle], ...] = Field(

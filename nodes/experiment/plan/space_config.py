@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from advnerf_core.strict import Angle, StrictModel
-from nodes.experiment.plan.numbers import Count, NotNegative, Positive, PositiveNumber, Unit
+from nodes.experiment.plan.numbers import Count, Distance, Length, NotNegative, Positive, PositiveNumber, Unit
 from nodes.lab.located import NamedFile
 
 
@@ -30,7 +30,7 @@ class PlacesConfig(StrictModel):
     colours: bool = Field(default=True, description="Whether the colours are searched too.")
     samples: Positive = Field(default=5, description="Placements that are drawn.")
     steps: Positive = Field(default=10, description="Evaluations of each placement.")
-    move_m: NotNegative = Field(default=1.5, description="An object's x and y may change by this [m].")
+    move_m: Distance = Field(default=1.5, description="An object's x and y may change by this [m].")
     turn_rad: Angle = Field(
         default=0.6,
         ge=0.0,
@@ -42,7 +42,7 @@ class PlacesConfig(StrictModel):
     colour_rate: PositiveNumber = Field(
         default=0.5, description="Adam's step of the colours before squashing."
     )
-    keep_out_m: NotNegative | None = Field(
+    keep_out_m: Distance | None = Field(
         default=None,
         description="Least distance of every footprint from the middles of the lanes [m]; none: half a lane.",
     )
@@ -67,7 +67,7 @@ class PlacesConfig(StrictModel):
 
 class _MeshConfig(StrictModel):
     texels: Positive = Field(default=32, description="Texels along the longest side of an object.")
-    ball_m: PositiveNumber | None = Field(
+    ball_m: Length | None = Field(
         default=None,
         description="The objects are balls of this radius, before their own scale [m]; none: their meshes.",
     )
@@ -89,7 +89,7 @@ class MeshShapeConfig(_MeshConfig):
 
     kind: Literal["mesh_shape"]
     searched: ClassVar[str] = "The shapes of {} as meshes are searched over the world's own pictures"
-    bound_m: PositiveNumber = Field(default=0.4, description="No vertex moves farther [m].")
+    bound_m: Length = Field(default=0.4, description="No vertex moves farther [m].")
     smoothness: NotNegative = Field(
         default=19.0, description="Lambda of the large-steps preconditioner; 0: none."
     )

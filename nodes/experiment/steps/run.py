@@ -128,6 +128,7 @@ def _check_places(experiment: Experiment, document: Document) -> None:
             message = unknown(name, "path", experiment.world.paths)
             raise ConfigError(f"{document.place(('paths', index))}: paths: {message}")
     _check_start_sigma(experiment, document)
+    _check_start_poses(experiment, document)
     if experiment.config.own_scene or isinstance(experiment.named_world.make(), Photographed):
         _check_undriven(experiment, document)
     by_hand = [
@@ -155,6 +156,19 @@ def _check_start_sigma(experiment: Experiment, document: Document) -> None:
             f"{document.place(('attack', 'start_sigma'))}: expected attack.start_sigma to be at most half of the off-track limit, "
             f"{limit_m:g} m, got {sigma:g}; with more, drives begin off the track"
         )
+
+
+def _check_start_poses(experiment: Experiment, document: Document) -> None:
+    """Check that given starts are on the track of every path that is driven."""
+    poses, limit_m = experiment.config.attack.start_poses, experiment.world.off_track_m
+    for index, (x_m, y_m, _) in enumerate(poses):
+        for name in experiment.config.cell_paths:
+            cte_m = float(experiment.paths[name].project((x_m, y_m)).cte_m)
+            if abs(cte_m) > limit_m:
+                raise ConfigError(
+                    f"{document.place(('attack', 'start_poses', index))}: expected attack.start_poses on the track, at most {limit_m:g} m from the "
+                    f"middle of the path {name}, got x = {x_m:g} m, y = {y_m:g} m, which is {abs(cte_m):.2f} m from it; give them in metres, as the path"
+                )
 
 
 def _check_panel(carrier: FaceCarrier, experiment: Experiment, document: Document) -> None:

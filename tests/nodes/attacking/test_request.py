@@ -1,9 +1,15 @@
+import contextlib
+from collections.abc import Iterator
+from typing import Annotated, Any, get_args
+
 import numpy as np
 import pytest
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from advnerf_core.errors import AdvnerfError
 from nodes.experiment.node.prepare import load_request, prepare, request_text
 from nodes.experiment.node.request import parse_request
+from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.show.own_scene import own_objects
 from nodes.runtime.errors import ConfigError
@@ -65,6 +71,11 @@ def test_a_panel_looks_where_it_says_and_may_be_tilted():
             "expected no attack.goals, or one for each of 1 start_poses, got 2",
         ),
         (["attack.response.delay_s=.nan"], "attack.response.delay_s"),
+        (["attack.start_poses=[[1.2, -1.8, 0], [120, -180, 0]]"], r"on the track, at most 0.4 m .* x = 120 m, y = -180 m"),
+        (["attack.robustness.jitter_m=10"], "jitter_m: expected at most 1 m, not cm or mm, got 10"),
+        (["attack.robustness.noise=25"], "attack.robustness.noise: input should be less than or equal to 1, got 25"),
+        (["attack.response.slew_radps=180"], "slew_radps: expected at most 100 rad/s, not degrees/s, got 180"),
+        (["objects=[{name: a, kind: panel, x_m: 0, y_m: 0, bounds: {yaw_rad: [0, 90]}}]"], "yaw_rad.1: expected radians"),
         (["over.method=[gradient, random]"], "expected one method of attack in over.method"),
         (["over.method=[none]"], "expected one method of attack in over.method"),
         (["over.attack.evaluations=[2, 3]"], "expected no variants"),
@@ -80,6 +91,36 @@ def test_a_panel_looks_where_it_says_and_may_be_tilted():
 def test_what_is_wrong_is_one_error_that_says_where(tmp_path, change, message):
     with pytest.raises(AdvnerfError, match=message):
         loaded(tiny_request(tmp_path), change)
+
+
+# Places of a world, which is as large as a town, and ways along its paths.
+_OF_A_WORLD = {"x_m", "y_m", "z_m", "driven_m", "drives_from_m"}
+
+
+def _lengths_of(model: type[BaseModel], seen: set[type]) -> Iterator[tuple[str, Any]]:
+    seen.add(model)
+    for name, field in model.model_fields.items():
+        if name.endswith("_m") and name not in _OF_A_WORLD:
+            yield f"{model.__name__}.{name}", Annotated[(field.annotation, *field.metadata, None)]
+        inside = [field.annotation]
+        for part in inside:
+            inside += get_args(part)
+            if isinstance(part, type) and issubclass(part, BaseModel) and part not in seen:
+                yield from _lengths_of(part, seen)
+
+
+def test_no_length_of_an_experiment_may_be_in_millimetres():
+    found = dict(_lengths_of(ExperimentConfig, set()))
+    assert {"ExperimentConfig.held_cap_m", "PlacesConfig.move_m", "FaceConfig.size_m"} <= found.keys()
+    for name, annotation in found.items():
+        adapter, passed = TypeAdapter(annotation), 0
+        for shape in (lambda m: m, lambda m: (m,), lambda m: ((m, m),)):
+            with contextlib.suppress(ValidationError):
+                adapter.validate_python(shape(0.5))
+                passed += 1
+                with pytest.raises(ValidationError, match="not cm or mm"):
+                    adapter.validate_python(shape(500.0))
+        assert passed, name
 
 
 def test_the_error_names_file_and_line(tmp_path):
