@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.image_gradients import image_gradients
+from advnerf_core.attack.image_gradients import image_gradients, with_history
 from advnerf_core.attack.objective import loss_slopes
 from advnerf_core.attack.problem import (
     AttackProblem,
@@ -260,6 +260,7 @@ def _sequential_terms(
             images = rendered.images.detach().requires_grad_()
             memory = memories[t].detach().requires_grad_()
             outputs = problem.policy(images, problem.goals, memory)
+            with_history(outputs[0])
             seeds = (control_slopes[t].to(outputs[0].dtype), memory_slope)
             grad_images, slope = torch.autograd.grad(outputs, (images, memory), seeds, allow_unused=True)
         memory_slope = torch.zeros_like(memory) if slope is None else slope

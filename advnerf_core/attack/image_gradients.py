@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.contract import PolicyContractError
 from advnerf_core.policies.number_type import layer_type
 
 LEAST_COSINE = 0.9999
@@ -40,9 +41,23 @@ def image_gradients(
         images = images.contiguous(memory_format=torch.channels_last)
     images = images.detach().requires_grad_()
     with torch.enable_grad(), torch.autocast("cpu", torch.bfloat16, enabled=reduced):
-        controls: Tensor = policy(images, goals)
+        controls = with_history(policy(images, goals))
     (gradient,) = torch.autograd.grad(controls, images, slopes.to(controls.dtype))
     return gradient
+
+
+def with_history(steering: Tensor) -> Tensor:
+    """The steering that a policy has computed from images, which must have a gradient.
+
+    Raises:
+        PolicyContractError: It has none.
+    """
+    if not steering.requires_grad:
+        raise PolicyContractError(
+            "expected a policy that is differentiable in its images, got steering without a gradient; compute it with torch, without detach() and "
+            "no_grad, or declare differentiable = False and search with a method that needs no gradient"
+        )
+    return steering
 
 
 def agrees_in_bfloat16(policy: Any, camera: Pinhole, goal_size: int = 0) -> bool:

@@ -218,7 +218,9 @@ def losses_of(objective: Objective, drives: JudgedDrives) -> Tensor:
     Raises:
         ObjectiveError: The objective does not give one number for each drive.
     """
-    return _one_each(objective, "loss", objective.loss(drives), drives)
+    found = _one_each(objective, "loss", objective.loss(drives), drives)
+    # Whole numbers have no mean, and no gradient that could be looked for.
+    return found if found.is_floating_point() else found.to(drives.states.dtype)
 
 
 def loss_slopes(objective: Objective, drives: JudgedDrives) -> tuple[float, Tensor]:

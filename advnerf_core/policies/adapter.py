@@ -56,6 +56,10 @@ class AdaptedPolicy(nn.Module):
         self._check_goals(goals, len(images))
         raw, memory = answer(self.contract, self.network, images, goals, memory)
         steering = self.contract.to_steering_rad(raw, len(images))
+        if not isinstance(steering, Tensor):
+            raise PolicyContractError(
+                f"expected steering as a tensor of torch from the network, got {type(steering).__name__}; return one, as torch.from_numpy makes it"
+            )
         return steering if self.stateless else (steering, memory)
 
     def answers_mrad(self) -> list[int]:

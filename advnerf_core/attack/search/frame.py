@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import evaluate, roll_out
+from advnerf_core.attack.image_gradients import with_history
 from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.problem import AttackProblem, SearchDivergedError
 from advnerf_core.attack.search.gradient import Slope, climb
@@ -102,7 +103,7 @@ class CleanFrames:
             goals = None if problem.goals is None else problem.goals.repeat(ticks, 1)
             with torch.enable_grad():
                 images = rendered.images.detach().requires_grad_()
-                steering = problem.policy(images, goals).sum()
+                steering = with_history(problem.policy(images, goals)).sum()
                 (slope,) = torch.autograd.grad(steering, images)
             yield float(steering.detach()), rendered.vjp(slope)
 

@@ -1,11 +1,13 @@
 """Gradients of a policy's control with respect to its images, in float32 and in bfloat16."""
 
+import pytest
 import torch
 from torch import nn
 from torch.nn.functional import cosine_similarity
 
 from advnerf_core.attack.image_gradients import LEAST_COSINE, agrees_in_bfloat16, image_gradients
 from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.contract import PolicyContractError
 from advnerf_core.policies.number_type import layer_type
 from advnerf_core.policies.pilotnet import PilotNet
 
@@ -58,3 +60,14 @@ def test_only_a_network_whose_direction_stays_is_computed_in_bfloat16():
     assert not agrees_in_bfloat16(network().double(), CAMERA)
     assert not agrees_in_bfloat16(Brittle().eval(), CAMERA)
     assert not agrees_in_bfloat16(lambda images, goals: images.mean((1, 2, 3)), CAMERA)
+
+
+def test_a_policy_that_detaches_its_steering_is_told_so():
+    class Detached(nn.Module):
+        stateless, differentiable, goal_size = True, True, 0
+
+        def forward(self, images, goals=None):
+            return images.mean((1, 2, 3)).detach()
+
+    with pytest.raises(PolicyContractError, match="got steering without a gradient; compute it with torch"):
+        image_gradients(Detached(), torch.rand(1, 3, 66, 200), None, torch.ones(1))

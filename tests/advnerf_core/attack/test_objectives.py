@@ -201,6 +201,10 @@ def test_what_breaks_the_contract_is_one_line():
         def value(self, drives):
             return torch.ones(drives.states.shape[1])
 
+    class Counts(Objective):
+        def value(self, drives):
+            return (drives.cte_m.abs() > 0.1).sum(0)
+
     class Whole(Objective):
         def value(self, drives):
             return drives.cte_m.abs().sum()
@@ -209,6 +213,8 @@ def test_what_breaks_the_contract_is_one_line():
     assert values_of(Constant(), drives).tolist() == [1.0, 1.0, 1.0]
     with pytest.raises(ObjectiveError, match=r"loss of Constant that is differentiable in drives.states"):
         loss_slopes(Constant(), drives)
+    with pytest.raises(ObjectiveError, match=r"loss of Counts that is differentiable"):
+        loss_slopes(Counts(), drives)
     with pytest.raises(ObjectiveError, match=r"value of Whole to return a tensor \[3\].*got shape \[\]"):
         values_of(Whole(), drives)
     with pytest.raises(ObjectiveError, match=r"expected a place with solids for the objective Collision"):

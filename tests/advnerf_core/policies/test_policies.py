@@ -102,6 +102,8 @@ def test_wrong_inputs_and_outputs_are_refused():
         policy(torch.zeros(1, 3, 22, 40))
     with pytest.raises(PolicyContractError, match="return the column that steers"):
         policy(images())
+    with pytest.raises(PolicyContractError, match=r"expected steering as a tensor of torch .* got ndarray"):
+        adapt(lambda given: np.zeros(len(given)), PolicyContract(VIEW))(images())
     with pytest.raises(PolicyContractError, match="initial_memory"):
         adapt(net(), PolicyContract(VIEW, stateless=False))
 
