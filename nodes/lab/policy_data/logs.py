@@ -51,13 +51,23 @@ def open_logs(
 
     Args:
         labels: Source of the labels; None leaves it to the format.
+
+    Raises:
+        AdvnerfError: The format of one is unknown, one is damaged, or two are one log with the same settings.
     """
-    opened = []
+    opened = dict[tuple[tuple[Path, ...], LogChoice], OpenLog]()
     for request in requests:
         choice = request.choice(common)
         log = open_log(request.path, choice)
-        opened.append(OpenLog(str(request), choice, log, labels or log.labels))
-    return opened
+        # Under other settings it is another log: that of another camera, for example.
+        key = tuple(file.resolve() for file in log.files), choice
+        if key in opened:
+            raise LogError(
+                f"expected every log once, as its frames are learned from or held out, got {opened[key].name} and {request}, which are the same; "
+                "remove one of them"
+            )
+        opened[key] = OpenLog(str(request), choice, log, labels or log.labels)
+    return list(opened.values())
 
 
 def open_log(path: Path, choice: LogChoice | None = None) -> DriveLog:

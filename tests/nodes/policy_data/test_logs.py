@@ -91,6 +91,16 @@ def test_a_udacity_log_is_read_as_it_was_downloaded(tmp_path, header, prefix):
     assert log.unit.wheel_rad(0.5, "here") == pytest.approx(-math.radians(12.5))
 
 
+@pytest.mark.parametrize("form", FORMATS)
+def test_one_log_under_two_spellings_is_refused_and_two_cameras_of_it_are_not(tmp_path, form):
+    folder = FORMATS[form](tmp_path / "log")
+    (tmp_path / "link").symlink_to(folder)
+    common = LogChoice(steering_full_rad=0.4)
+    with pytest.raises(LogError, match=r"every log once.* got .*/log and .*/link, which are the same"):
+        open_logs([LogRequest(folder), LogRequest(tmp_path / "link")], common)
+    assert len(open_logs([LogRequest(folder), LogRequest(folder, "steering-offset-rad=-0.1")], common)) == 2
+
+
 def test_a_camera_at_the_side_needs_an_offset(tmp_path):
     folder = write_udacity(tmp_path / "log", False)
     with pytest.raises(LogError, match=r"steering belongs to the center camera.*steering-offset-rad"):
