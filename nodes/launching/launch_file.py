@@ -140,8 +140,9 @@ def _apply_override(document: Document, override: str) -> None:
         key = ("nodes", *prefix, *rest.split("."))
         document.places[key] = f"--set {override}"
     else:
+        hint = "; write NODE.KEY=VALUE, without nodes and config" if head == "nodes" else ""
         raise ConfigError(
-            f"--set {override}: no node called {head!r}; known are {', '.join(nodes)}, and params"
+            f"--set {override}: no node called {head!r}; known are {', '.join(nodes)}, and params{hint}"
         )
 
 

@@ -375,6 +375,7 @@ def test_a_module_in_the_working_folder_is_found_whatever_started_the_command(tm
     ("override", "message"),
     [
         ("c.x=1", "no node called 'c'; known are a, b, and params"),
+        ("nodes.a.config.x=1", "write NODE.KEY=VALUE, without nodes and config"),
         ("params.speed=1", "unknown parameter; known are rate_hz, with_b"),
         ("a", "expected NODE.KEY=VALUE"),
         ("a.x", "expected NODE.KEY=VALUE"),
