@@ -31,6 +31,7 @@ from advnerf_core.strict import strict_validator
 T = TypeVar("T")
 # What a user's code raises when it fails; a call of sys.exit would end the command as if all were well.
 FAILURES = (Exception, SystemExit)
+EXITED = "expected a policy, method or other code of yours to return, it has called sys.exit"
 
 
 class PluginError(AdvnerfError):
@@ -325,9 +326,7 @@ def exit_refused() -> Iterator[None]:
     except SystemExit as asked:
         if asked.code not in (None, 0):
             raise
-        raise PluginError(
-            "expected a policy, method or other code of yours to return, it has called sys.exit"
-        ) from asked
+        raise PluginError(EXITED) from asked
 
 
 def in_one_line(error: BaseException) -> str:

@@ -207,7 +207,7 @@ def values_of(objective: Objective, drives: JudgedDrives) -> Tensor:
     """The value of each drive, without history.
 
     Raises:
-        ObjectiveError: The objective does not give one number for each drive.
+        ObjectiveError: The objective does not give one finite number for each drive.
     """
     return _one_each(objective, "value", objective.value(drives), drives).detach().to(drives.states.dtype)
 
@@ -216,7 +216,7 @@ def losses_of(objective: Objective, drives: JudgedDrives) -> Tensor:
     """The loss of each drive, with its history.
 
     Raises:
-        ObjectiveError: The objective does not give one number for each drive.
+        ObjectiveError: The objective does not give one finite number for each drive.
     """
     found = _one_each(objective, "loss", objective.loss(drives), drives)
     # Whole numbers have no mean, and no gradient that could be looked for.
@@ -247,5 +247,10 @@ def _one_each(objective: Objective, what: str, found: object, drives: JudgedDriv
         got = f"shape {list(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
         raise ObjectiveError(
             f"expected {what} of {type(objective).__name__} to return a tensor [{count}], one number for each drive, got {got}"
+        )
+    if not torch.isfinite(found).all() and torch.isfinite(drives.states).all():
+        raise ObjectiveError(
+            f"expected a finite {what} of {type(objective).__name__} for each drive, got {found.tolist()} of finite drives; look for a division by 0, "
+            "or a root or logarithm of what may be negative"
         )
     return found

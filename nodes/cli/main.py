@@ -87,6 +87,7 @@ app.command("disarm")(cli_arm.disarm)
 app.add_typer(cli_bag.app, name="bag")
 app.command("doctor")(cli_doctor.doctor)
 _debug = False
+_is_in_command = False
 
 
 def _print_version(wanted: bool) -> None:
@@ -105,8 +106,8 @@ def options(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
     """Options of all commands."""
-    global _debug
-    _debug = debug
+    global _debug, _is_in_command
+    _debug, _is_in_command = debug, True
 
 
 @app.command()
@@ -231,7 +232,7 @@ def _exit_code() -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except SystemExit as asked:
-        return asked.code if isinstance(asked.code, int) else FAILURE_EXIT
+        return _code_of_exit(asked.code)
     except typer.Abort:
         say_error("aborted")
         return FAILURE_EXIT
@@ -244,6 +245,18 @@ def _exit_code() -> int:
     except Exception as error:
         return _code_of(error)
     return ended if isinstance(ended, int) else 0
+
+
+def _code_of_exit(code: str | int | None) -> int:
+    """Exit code of what ended by ``sys.exit``: a signal, the shell's completion before a command, or a user's code inside one."""
+    if isinstance(code, int) and code:
+        return code
+    if not _is_in_command:
+        return FAILURE_EXIT if code else 0
+    from advnerf_core.plugins import EXITED
+
+    say_error(f"{EXITED}({code or ''})")
+    return ERROR_EXIT
 
 
 def _code_of(error: Exception) -> int:

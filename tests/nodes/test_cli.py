@@ -315,6 +315,14 @@ def test_defect_of_ours_keeps_its_traceback(monkeypatch):
         cli.main()
 
 
+@pytest.mark.parametrize("code", [None, 0, "no weights"])
+def test_a_users_code_that_exits_inside_a_command_is_an_error(command, monkeypatch, tmp_path, code):
+    monkeypatch.setattr("nodes.lab.method_check.check_method", lambda *_: sys.exit(code))
+    ended, _, errors = command("attack", "method", "check", "random")
+    assert ended == 2
+    assert f"code of yours to return, it has called sys.exit({code or ''})" in errors
+
+
 def test_play_refuses_what_is_not_there(command, tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/vicon/car", encode(pose_message(np.eye(4), 1)), 1, 1, 0)

@@ -205,6 +205,10 @@ def test_what_breaks_the_contract_is_one_line():
         def value(self, drives):
             return (drives.cte_m.abs() > 0.1).sum(0)
 
+    class Root(Objective):
+        def value(self, drives):
+            return (-1.0 - drives.cte_m.abs().sum(0)).sqrt()
+
     class Whole(Objective):
         def value(self, drives):
             return drives.cte_m.abs().sum()
@@ -215,6 +219,11 @@ def test_what_breaks_the_contract_is_one_line():
         loss_slopes(Constant(), drives)
     with pytest.raises(ObjectiveError, match=r"loss of Counts that is differentiable"):
         loss_slopes(Counts(), drives)
+    for judged in (values_of, losses_of):
+        with pytest.raises(
+            ObjectiveError, match=r"finite (value|loss) of Root for each drive, got \[nan, nan, nan\]"
+        ):
+            judged(Root(), drives)
     with pytest.raises(ObjectiveError, match=r"value of Whole to return a tensor \[3\].*got shape \[\]"):
         values_of(Whole(), drives)
     with pytest.raises(ObjectiveError, match=r"expected a place with solids for the objective Collision"):
