@@ -42,7 +42,7 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 
 class MethodError(AdvnerfError, ValueError):
-    """A method was given options that it does not have."""
+    """A method was given options that it does not have, or does not keep its contract."""
 
 
 @dataclass(frozen=True)

@@ -70,8 +70,13 @@ class SearchState:
         return evaluation
 
     def result(self) -> SearchResult:
-        """The current result; needs at least one evaluation."""
-        assert self.best_theta is not None
+        """The current result.
+
+        Raises:
+            SearchStateError: Nothing was evaluated.
+        """
+        if self.best_theta is None:
+            raise SearchStateError("expected at least one evaluation before the result of a search, got none")
         return SearchResult(self.best_theta, self.best, tuple(self.history))
 
     def save(self, path: Path, fingerprint: str) -> None:

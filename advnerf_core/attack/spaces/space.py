@@ -24,7 +24,7 @@ from advnerf_core.attack.artifact import (
     AttackFileError,
     face_texture,
 )
-from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
+from advnerf_core.attack.methods import Method, MethodError, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem, Sensor
 from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
@@ -145,6 +145,27 @@ class Space(Protocol):
         """
 
 
+def searched(
+    method: Method, name: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun
+) -> SearchResult:
+    """The result of a method's search, which spent no more than the budget: methods are compared by what they find with the same one.
+
+    Raises:
+        MethodError: It spent more, or returns something else.
+    """
+    found: object = method.search(problem, settings, run)
+    wanted, got = "a SearchResult", type(found).__name__
+    if isinstance(found, SearchResult):
+        shape, count = tuple(problem.sensor.theta_shape), len(found.history)
+        if tuple(found.theta.shape) == shape and 1 <= count <= settings.evaluations:
+            return found
+        wanted = f"theta {list(shape)} after 1 to {settings.evaluations} evaluations, which are the budget of every method"
+        got = f"{list(found.theta.shape)} after {count}"
+    raise MethodError(
+        f"attack method {name}: expected {wanted}, got {got}; correct it: 'advnerf attack method check' looks at all that a method must keep"
+    )
+
+
 def require_same(attack: AttackFile, named: Sequence[NamedObject]) -> None:
     """Raise for an attack file of other objects.
 
@@ -203,7 +224,7 @@ class ColourSpace:
         self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun
     ) -> SearchResult:
         """Search with any method; see `Space.search`."""
-        return load_method(method).search(problem, settings, run)
+        return searched(load_method(method), method, problem, settings, run)
 
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
         """Colours of each object; for a mesh also the mesh with its attacked texture."""
@@ -272,7 +293,7 @@ class ShapeSpace:
             raise SpaceError(
                 f"expected a method that searches shapes, such as gradient or random, got {method}: its steps are those of colours"
             )
-        return found.search(problem, settings, run)
+        return searched(found, method, problem, settings, run)
 
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
         """The search's parameters of each vertex, and the meshes in the attacked shape."""

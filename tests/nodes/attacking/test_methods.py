@@ -9,6 +9,7 @@ import torch
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.methods import MethodError
 from advnerf_core.attack.search.search import SearchStateError
+from advnerf_core.errors import AdvnerfError
 from nodes.cli import main as cli
 from nodes.experiment.node.prepare import prepare, request_text
 from nodes.experiment.node.request import parse_request
@@ -67,6 +68,24 @@ def test_a_method_of_a_file_runs_a_request_and_resumes_to_the_same_bytes(tmp_pat
     assert len(curve["loss_m"]) == 3
     expected = spiral_theta(attack.face_object.theta.shape, curve["best_evaluation"], turns=0.25)
     torch.testing.assert_close(torch.from_numpy(attack.face_object.theta), expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ("< settings.evaluations:", "< 2 * settings.evaluations:", r"after 1 to 3 evaluations, .*, got \[8, 8, 3\] after 6"),
+        ("return state.result()", "return state.result().theta", "expected a SearchResult, got Tensor"),
+        ("< settings.evaluations:", "< 0:", "expected at least one evaluation before the result"),
+    ],
+)  # fmt: skip
+def test_a_method_that_breaks_the_contract_gives_no_attack(tmp_path, before, after, says):
+    file = tiny_request(tmp_path)
+    spiral = write_spiral(tmp_path)
+    assert before in spiral.read_text()
+    spiral.write_text(spiral.read_text().replace(before, after))
+    with pytest.raises(AdvnerfError, match=says):
+        run_attack(loaded(file, [FROM_FILE]), tmp_path / "out", ProgressDisplay())
+    assert not list((tmp_path / "out").glob("*.attack.safetensors"))
 
 
 def test_a_method_of_an_installed_package_runs_a_request(tmp_path, monkeypatch):
