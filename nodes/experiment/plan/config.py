@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from advnerf_core.plugins import name_in_results
 from advnerf_core.report.conditions import CONTROLS, EMPTY
@@ -43,10 +43,19 @@ from nodes.experiment.plan.victims import (
 SCENE, POLICY = "scene", "policy"
 
 
+def _name_of_a_folder(name: str) -> str:
+    """The name, under which results lie in ``runs`` and published ones in ``docs/results``; another folder has no place in it."""
+    if "/" in name or "\0" in name or name in (".", ".."):
+        raise ValueError(
+            "expected a name without /, as it becomes that of a folder; --folder says where results go"
+        )
+    return name
+
+
 class ExperimentConfig(StrictModel):
     """One experiment, resolved: the file's values, one of its settings over them, then the command line."""
 
-    name: str = Field(min_length=1)
+    name: Annotated[str, AfterValidator(_name_of_a_folder)] = Field(min_length=1)
     world: dict[str, Any] = Field(
         description="kind: junction, carla, an installed package's, scene (a learned scene of your own), or file.py:Class relative to this file; and "
         "changes of that world's Config."

@@ -61,6 +61,7 @@ def test_a_panel_looks_where_it_says_and_may_be_tilted():
             ["over.method=[annealing]"],
             r"over.method.0: expected an attack method of random, .*, cem, .*; got 'annealing'; one of your own",
         ),
+        (["name=../other"], "name: expected a name without /, as it becomes that of a folder"),
         (["attack.evaluations=0"], r"attack.evaluations: .* greater than or equal to 1"),
         (["objects=[]"], "expected objects whose places are given"),
         (["objects=[{name: a, kind: panel}]"], r"objects.0.*x_m"),
