@@ -38,6 +38,14 @@ _DONE = "advnerf_strict"
 _NOT_SCHEMAS = frozenset({"metadata", "default", "serialization", "expected", "config", "cls", "ref"})
 # In pydantic's path of a wrong value: a tag of several words, a type with parameters, the name of a class.
 _INSERTED = re.compile(r"[ \[]|^[A-Z][A-Za-z0-9]*[a-z][A-Za-z0-9]*$")
+# Types of pydantic errors that name a Python type, and what a file has instead.
+_NOT_OF_YAML = {
+    "tuple_type": "a list in brackets",
+    "list_type": "a list in brackets",
+    "dict_type": "keys and values",
+    "model_type": "keys and values",
+    "dataclass_type": "keys and values",
+}
 _DATES = frozenset({"date", "datetime", "time", "timedelta"})
 
 
@@ -279,6 +287,11 @@ def _what(model: Any, key: Key, problem: Any) -> str:
         return f"{name}: expected at least {problem['ctx']['min_length']}, got {problem['ctx']['actual_length'] or 'none'}"
     if problem["type"] == "missing":
         return f"{name} is missing; add it"
+    if problem["type"] == "union_tag_not_found":
+        tag = str(problem["ctx"]["discriminator"]).strip("'")
+        return f"{name}.{tag} is missing; add it" if key else f"{tag} is missing; add it"
+    if problem["type"] in _NOT_OF_YAML:
+        return f"{name}: expected {_NOT_OF_YAML[problem['type']]}, got {problem['input']!r:.80}"
     if problem["type"] == "union_tag_invalid":
         context = problem["ctx"]
         return f"{name}: expected {context['discriminator']} to be one of {context['expected_tags']}, got {context['tag']!r}"

@@ -165,7 +165,7 @@ def test_cells_are_selected_by_what_they_are(file):
         ("before: near", "before: nearer", r":16: contrasts.0: expected a variant of near, .*'nearer' \(did you mean near\?\)"),
         ("    places:", "    straight_places: {over.path: [straight]}\n    places:", "straight_places_hardened_none_0 2 times; rename"),
         ("  victim:", "  attack.starts: [1, 1]\n  victim:", "two variants of the name near_starts-1"),
-        ("  victim:", "  attack.starts: 2\n  victim:", r":12: over.attack.starts: input should be a valid list"),
+        ("  victim:", "  attack.starts: 2\n  victim:", r":12: over.attack.starts: expected a list in brackets, got 2"),
     ],
 )  # fmt: skip
 def test_a_bad_file_is_told_with_its_line(file, old, new, says):

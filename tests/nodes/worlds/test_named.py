@@ -142,7 +142,7 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ("kind: yard.py:Yard\nseed: many", r":2: seed: input should be a valid integer.*got 'many'"),
         (
             "kind: yard.py:Yard\nlens: 3",
-            r":2: lens: input should be a dictionary or an instance of Lens, got 3",
+            r":2: lens: expected keys and values, got 3",
         ),
         ("kind: yard.py:Modelled\nsede: 4", r":2: unknown key sede; valid keys here: lens, seed"),
         (
