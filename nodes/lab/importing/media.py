@@ -127,7 +127,7 @@ def _copy_photographs(files: Sequence[Path], folder: Path, report: Report) -> li
         heif = file.suffix.lower() in image_files.HEIF_SUFFIXES
         copy = folder / f"{_unique(file.stem, names)}{'.jpg' if heif else file.suffix.lower()}"
         try:
-            if not (copy.exists() and copy.stat().st_mtime_ns >= file.stat().st_mtime_ns):
+            if not (copy.exists() and copy.stat().st_mtime_ns == file.stat().st_mtime_ns):
                 _copy(file, copy)
             copies.append(copy)
         except DatasetError as error:
@@ -146,7 +146,7 @@ def _copy_photographs(files: Sequence[Path], folder: Path, report: Report) -> li
 
 
 def _copy(file: Path, copy: Path) -> None:
-    """Make a complete, readable copy that is also upright for readers that ignore EXIF."""
+    """Make a complete, readable copy that is also upright for readers that ignore EXIF, and as old as the file, by which it is known."""
     data = image_files.read_bytes(file)
     turn = image_bytes.orientation(data)
     heif = image_bytes.is_heif(data)
@@ -158,4 +158,4 @@ def _copy(file: Path, copy: Path) -> None:
         data = data[:2] + exif + data[2:] if copy.suffix in (".jpg", ".jpeg") else data
     write_atomically(copy, data)
     now = file.stat()
-    os.utime(copy, ns=(now.st_atime_ns, max(now.st_mtime_ns, copy.stat().st_mtime_ns)))
+    os.utime(copy, ns=(now.st_atime_ns, now.st_mtime_ns))

@@ -1,3 +1,4 @@
+import os
 import sys
 
 import cv2
@@ -71,6 +72,16 @@ def test_a_second_run_copies_nothing_and_drops_what_left(tmp_path):
     assert again.images == (source.images[0], source.images[2])
     assert [(tmp_path / "out" / name).stat().st_mtime_ns for name in again.images] == [stamps[0], stamps[2]]
     assert not (tmp_path / "out" / source.images[1]).exists()
+
+
+def test_older_photographs_of_the_same_names_replace_the_copies(tmp_path):
+    """Cameras count from IMG_0001 again: the copies of the first day are no pictures of the second, which may be older than they are."""
+    first, second = photo(tmp_path / "day1" / "phone" / "0.jpg"), photo(tmp_path / "day2" / "phone" / "0.jpg")
+    cv2.imwrite(str(second), np.zeros((24, 32, 3), np.uint8))
+    os.utime(second, ns=(0, 1_000_000_000))
+    for file in (first, second):
+        (source,) = gather([file.parent], tmp_path / "out", MediaConfig(), quiet)
+        assert (tmp_path / "out" / source.images[0]).read_bytes() == file.read_bytes()
 
 
 def test_at_most_so_many_are_taken_evenly(tmp_path):
