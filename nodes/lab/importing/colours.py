@@ -16,6 +16,7 @@ from advnerf_core.scene.colour import IDENTITY, ColourMap, fit_colour_map
 from advnerf_core.scene.field import load_scene, save_scene
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
+from advnerf_core.splats.scene_file import is_splat_scene
 from nodes.lab.importing.errors import ImportRecordingError
 
 # Rays with a higher transmittance have no scene colour to compare.
@@ -51,6 +52,10 @@ def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourM
         ImportRecordingError: The frames do not show the scene.
         PlaceError: The output is a file of the images.
     """
+    if is_splat_scene(scene):
+        raise ImportRecordingError(
+            f"expected a scene that was learned, got the splat {scene}, which has no colour map; train one with advnerf scene train"
+        )
     listed = load_transforms(images)
     refuse_overwriting(listed.files, [output])
     frames = listed.with_frames(thinned(list(listed.frames), most)).load()

@@ -10,9 +10,12 @@ from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.scene.colour import IDENTITY, ColourMap
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, load_scene, save_scene
 from advnerf_core.scene.render_field import FieldRenderer
+from advnerf_core.splats.renderer import SplatRenderer
+from advnerf_core.splats.scene_file import save_splat_scene
 from nodes.cli import main as cli
 from nodes.lab.importing.colours import match_colours
 from nodes.lab.importing.errors import ImportRecordingError
+from tests.support.splats import room
 
 CAMERA = Pinhole(40, 30, 30.0, 30.0, 20.0, 15.0)
 TRUE = ColourMap(((0.85, 0.1, 0.0), (0.05, 0.9, 0.0), (0.0, 0.1, 0.7)), (0.03, 0.0, 0.05), 1.2)
@@ -71,3 +74,10 @@ def test_frames_that_look_past_the_scene_are_refused(tmp_path, scene):
     images = frames_of(scene, tmp_path, [look_at([5.0, 5.0 + k, 0.0], [9.0, 9.0, 0.0]) for k in range(2)])
     with pytest.raises(ImportRecordingError, match=r"look into the scene of .*got 0\.0 % of their pixels"):
         match_colours(scene, images, scene, 4)
+
+
+def test_a_splat_has_no_colour_map(tmp_path):
+    splat = tmp_path / "splat.safetensors"
+    save_splat_scene(splat, SplatRenderer(room(60), box=((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))))
+    with pytest.raises(ImportRecordingError, match=r"expected a scene that was learned, got the splat"):
+        match_colours(splat, tmp_path / "transforms_car.json", splat, 4)
