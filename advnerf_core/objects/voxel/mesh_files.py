@@ -62,6 +62,12 @@ def load_mesh(
     mesh = stand(SurfaceMesh(tuple(parts)), up or ("y" if gltf else "z"), height_m, str(path))
     if height_m is None:
         mesh = mesh.scaled(_metres(path, mesh, unit, gltf))
+    side = float(mesh.size_m.max())
+    if not _SANE_SIDE_M[0] <= side <= _SANE_SIDE_M[1]:
+        given = f"the unit {unit}" if height_m is None else f"a height of {height_m:g} m"
+        raise MeshError(
+            f"expected {path} to have a longest side of {_SANE_SIDE_M[0]:g} to {_SANE_SIDE_M[1]:g} m, got {side:.4g} m by {given}; correct it"
+        )
     return SurfaceMesh(mesh.parts, tuple(dict.fromkeys(notes)), files.sha256())
 
 

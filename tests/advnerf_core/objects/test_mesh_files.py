@@ -134,6 +134,20 @@ def test_a_gltf_in_millimetres_is_refused_with_the_line_to_add(tmp_path):
     np.testing.assert_allclose(load_mesh(tmp_path / "box.glb", unit="mm").size_m, [0.04, 0.1, 1.0])
 
 
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        ({"unit": "m"}, r"got 1000 m by the unit m"),
+        ({"height_m": 75.0}, r"got 750 m by a height of 75 m"),
+        ({"height_m": 0.0005}, r"got 0\.005 m by a height of 0\.0005 m"),
+    ],
+)
+def test_a_unit_or_height_that_makes_no_object_is_refused(tmp_path, known, message):
+    trimesh.creation.box((40.0, 1000.0, 100.0)).export(tmp_path / "box.stl")
+    with pytest.raises(MeshError, match=r"a longest side of 0\.01 to 100 m, " + message):
+        load_mesh(tmp_path / "box.stl", **known)
+
+
 def test_an_objects_files_are_found_and_hashed(tmp_path):
     path = obj(tmp_path)
     (tmp_path / "my texture.png").write_bytes(png())
