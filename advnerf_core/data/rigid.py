@@ -9,6 +9,10 @@ import numpy as np
 from advnerf_core.geometry import Array
 
 _TOLERANCE = 0.01
+# Relative to the spread of the cameras, in any unit: single precision resolves a thousandth of the spread there. Anything farther has
+# a map's origin, not a scene's.
+_FARTHEST = 1e4
+_SPREAD_QUANTILE = 0.9
 
 
 def rigid_pose(matrix: Any) -> Array:
@@ -40,3 +44,17 @@ def rigid_pose(matrix: Any) -> Array:
     # The nearest rotation keeps rays of unit length.
     T[:3, :3] = u @ vt
     return T
+
+
+def far_from_origin(places: Array) -> tuple[int, str] | None:
+    """The camera ``[N, 3]`` that lies farther from the origin than single precision allows, and the problem in words; None if all are near."""
+    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    spread = float(np.quantile(away, _SPREAD_QUANTILE, method="lower"))
+    farthest = int(np.abs(places).max(axis=1).argmax())
+    value = float(np.abs(places[farthest]).max())
+    if spread <= 0.0 or value <= _FARTHEST * spread:
+        return None
+    return farthest, (
+        f"expected a camera within {_FARTHEST:.0f} times the spread of the cameras, {spread:.4g}, of the origin, got {value:.4g}; "
+        "take a common offset off all positions (map coordinates have a far origin), or leave the frame out"
+    )

@@ -18,7 +18,7 @@ from advnerf_core.data.errors import DatasetError, raise_all
 from advnerf_core.data.image_files import SUFFIXES, image_size
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.posed_image import PosedImage
-from advnerf_core.data.rigid import rigid_pose
+from advnerf_core.data.rigid import far_from_origin, rigid_pose
 from advnerf_core.data.scan_folder import from_scan_advice
 from advnerf_core.data.views import HELD_OUT_SPLITS, NGP_OFFSET, NGP_SCALE, TRAIN, PosedImages
 from advnerf_core.documents import read_json
@@ -53,10 +53,6 @@ _OTHER_KEYS = (
 # In the order in which they count where a file has several.
 _FOCAL_FORMS = (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y"), ("x_fov", "y_fov"))
 _SPLITS = (TRAIN, *HELD_OUT_SPLITS)
-# Relative to the spread of the cameras, in any unit: single precision resolves a thousandth of the spread there. Anything farther has
-# a map's origin, not a scene's.
-_FARTHEST = 1e4
-_SPREAD_QUANTILE = 0.9
 _Values = dict[str, Any]
 
 
@@ -236,16 +232,9 @@ def _pose(values: _Values) -> Array:
 
 def _refuse_far_away(path: Path, frames: Sequence[PosedImage]) -> None:
     places = np.stack([frame.T_world_from_camera[:3, 3] for frame in frames])
-    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-    spread = float(np.quantile(away, _SPREAD_QUANTILE, method="lower"))
-    farthest = int(np.abs(places).max(axis=1).argmax())
-    value = float(np.abs(places[farthest]).max())
-    if spread > 0.0 and value > _FARTHEST * spread:
-        raise DatasetError(
-            f"{path}: frame {frames[farthest].path.name}: transform_matrix: expected a camera within {_FARTHEST:.0f} times the spread "
-            f"of the cameras, {spread:.4g}, of the origin, got {value:.4g}; take a common offset off all positions (map coordinates "
-            "have a far origin), or leave the frame out"
-        )
+    if (wrong := far_from_origin(places)) is not None:
+        farthest, problem = wrong
+        raise DatasetError(f"{path}: frame {frames[farthest].path.name}: transform_matrix: {problem}")
 
 
 def _lens(values: _Values) -> Lens:

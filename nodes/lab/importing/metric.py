@@ -12,6 +12,7 @@ import numpy as np
 from advnerf_core.csv_rows import read_csv
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.lens import straightening
+from advnerf_core.data.rigid import far_from_origin
 from advnerf_core.data.similarity import Similarity
 from advnerf_core.errors import ConfigError
 from advnerf_core.geometry import Array
@@ -134,6 +135,9 @@ def _read_positions(file: Path) -> dict[str, Array]:
                 f"{row.place}: image: expected each image once, got {name} again; remove one row"
             )
         positions[name] = np.array([row.number(column) for column in ("x_m", "y_m", "z_m")])
+    # The data set takes over their world, and would be refused when it is read.
+    if positions and (wrong := far_from_origin(np.stack(list(positions.values())))) is not None:
+        raise ConfigError(f"{file}: {list(positions)[wrong[0]]}: {wrong[1]}")
     return positions
 
 

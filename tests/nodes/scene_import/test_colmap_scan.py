@@ -168,6 +168,16 @@ def test_positions_of_something_else_are_refused(tmp_path, ring):
         run(tmp_path, *ring, positions=wrong)
 
 
+def test_positions_with_the_origin_of_a_map_are_refused(tmp_path, ring):
+    """The data set would take over a world that no command reads."""
+    far = [T + np.array([[0, 0, 0, 5e5], [0, 0, 0, 5.4e6], [0, 0, 0, 0], [0, 0, 0, 0]]) for T in RING]
+    wrong = write_positions(tmp_path / "utm.csv", far)
+    with pytest.raises(
+        AdvnerfError, match=r"utm\.csv: .*of the origin, got 5\.4e\+06; take a common offset off"
+    ):
+        run(tmp_path, *ring, positions=wrong)
+
+
 def test_what_is_not_there_is_named_and_the_rest_is_used(tmp_path, ring):
     model, images = ring
     (images / "front" / "1.png").unlink()
