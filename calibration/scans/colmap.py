@@ -39,7 +39,16 @@ def read(path: Path, options: ScanOptions) -> Scan:
         pictures[image.name] = _picture(found, image, file)
     model = replace(found.model, images=tuple(kept), left_out=tuple(left_out))
     facts = {"colmap": {"model": str(found.folder), "images_by_model": found.sizes}}
-    return Scan(model, pictures, _UNKNOWN, points_by_id=found.points_by_id, folder=images, facts=facts)
+    thinned = frozenset(files) - {*pictures, *(each.name for each in left_out)}
+    return Scan(
+        model,
+        pictures,
+        _UNKNOWN,
+        points_by_id=found.points_by_id,
+        folder=images,
+        thinned=thinned,
+        facts=facts,
+    )
 
 
 def _picture(found: ColmapModel, image: Registered, file: Path) -> Picture:

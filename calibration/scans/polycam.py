@@ -71,7 +71,11 @@ def read(path: Path, options: ScanOptions) -> Scan:
     points = depth_points(depths, _VALUES_PER_M, _FARTHEST_M)
     kind = "corrected by Polycam" if corrected else "ARKit's; lens distortion is not corrected"
     model = model_of(found, left_out, path, points, kind)
-    return Scan(model, pictures, "metric: lengths of ARKit", True, UPRIGHT_FROM_Y_UP, folder=images)
+    named = {by_stem[each.stem].name for each in files if each.stem in by_stem}
+    thinned = frozenset(named - {*pictures, *(each.name for each in left_out)})
+    return Scan(
+        model, pictures, "metric: lengths of ARKit", True, UPRIGHT_FROM_Y_UP, folder=images, thinned=thinned
+    )
 
 
 def _keyframe(file: Path, image: Path, corrected: bool, digits: int) -> tuple[Registered, Picture, Pinhole]:

@@ -79,7 +79,8 @@ class Scan:
         R_upright_from_scan: Rotation ``[3, 3]`` to z up, if the scan knows gravity; None otherwise.
         reached: Points ``[M, 3]`` around the content, for the box of a scan without points.
         points_by_id: Points ``[3]`` by COLMAP's number.
-        folder: Folder whose other images are reported as left out.
+        folder: Folder whose other images are reported as left out, as they have no pose.
+        thinned: Names of images of the scan that ``--most`` leaves out.
         facts: Further content of the report.
     """
 
@@ -91,6 +92,7 @@ class Scan:
     reached: Array = field(default_factory=lambda: np.zeros((0, 3)))
     points_by_id: Mapping[int, Array] = field(default_factory=dict)
     folder: Path | None = None
+    thinned: frozenset[str] = frozenset()
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 

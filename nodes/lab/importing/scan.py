@@ -92,6 +92,7 @@ def _copy_images(
             kept.append(copied)
             pictures.append(picture)
         report((index + 1) / len(model.images), f"{index + 1} of {len(model.images)} images copied")
+    left_out += [LeftOut(name, "--most leaves it out") for name in sorted(scan.thinned)]
     known = {*scan.pictures, *(each.name for each in left_out)}
     left_out += [LeftOut(name, "it has no pose in the scan") for name in _others(scan.folder, known, made)]
     if len(kept) < MIN_IMAGES:

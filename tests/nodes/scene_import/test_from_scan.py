@@ -426,6 +426,13 @@ def test_recordings_are_thinned(tmp_path):
     assert len(frames) == 4
 
 
+def test_images_that_most_leaves_out_are_not_said_to_have_no_pose(tmp_path):
+    frames, report = run(tmp_path, scan_samples.polycam(tmp_path / "scan"), ScanOptions(most=4))
+    assert len(frames) == 4
+    assert {each["why"] for each in report["model"]["left_out"]} == {"--most leaves it out"}
+    assert len(report["model"]["left_out"]) == len(TRUTH) - 4
+
+
 def test_a_lens_and_images_may_be_given(tmp_path):
     scan = scan_samples.euroc(tmp_path / "scan", cameras=("cam0",))
     (scan / "mav0" / "cam0" / "sensor.yaml").unlink()
