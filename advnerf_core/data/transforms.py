@@ -134,7 +134,12 @@ def _read_json(path: Path) -> _Values:
         advice = from_scan_advice(path.parent, "correct the path")
         raise DatasetError(f"expected a transforms.json at {path}, found none; {advice}") from error
     except ConfigError as error:
-        raise DatasetError(str(error)) from error
+        other = (
+            ""
+            if path.suffix == ".json"
+            else f"expected a transforms.json or its folder, got {path}; it was read as one: "
+        )
+        raise DatasetError(f"{other}{error}") from error
     if not isinstance(content, dict):
         raise DatasetError(f"expected a JSON object in {path}, got {type(content).__name__}")
     return content

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from nodes.runtime.findings import CheckFinding
 
 _ADDRESS = re.compile(r"(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
+_LAST_PORT = 65535
 _POLICY_FILES = (".safetensors", ".onnx", ".pt2")
 Overrides = Annotated[
     list[str] | None,
@@ -100,8 +101,10 @@ Topics = Annotated[
 def listen_address(text: str) -> tuple[str, int]:
     """Host and port of ``HOST:PORT``; an IPv6 host keeps its brackets. Anything else raises `ConfigError`."""
     found = _ADDRESS.fullmatch(text)
-    if found is None:
-        raise ConfigError(f"expected HOST:PORT to listen on, got {text}")
+    if found is None or int(found[2]) > _LAST_PORT:
+        raise ConfigError(
+            f"expected HOST:PORT to listen on, got {text}; write a port of at most {_LAST_PORT}"
+        )
     return found[1], int(found[2])
 
 

@@ -288,3 +288,9 @@ def test_a_split_names_files_that_frames_have(tmp_path):
         DatasetError, match=r"test_filenames: expected names .* got 1 that no frame has.*images/1\.png"
     ):
         load_transforms(write(tmp_path, train_filenames=["0.png"], test_filenames=["images/1.png"]))
+
+
+def test_a_file_of_another_kind_is_told_by_what_is_expected(tmp_path):
+    (tmp_path / "splat.ply").write_bytes(b"ply\n\xbf\x00")
+    with pytest.raises(DatasetError, match=r"expected a transforms\.json or its folder, got .*splat\.ply"):
+        load_transforms(tmp_path / "splat.ply")
