@@ -71,8 +71,8 @@ def _trajectory(path: Path) -> Trajectory:
             f"{files[0]}: expected rows timestamp tx ty tz qx qy qz qw, got {rows.shape[1]} columns; export the trajectory again"
         )
     for line in read_text(files[0]).splitlines():
-        if line.startswith("#") and len(names := line.strip("# ").replace(",", " ").split()) == 8:
-            require_order(names[1:], "xyzxyzw", files[0])
+        if line.startswith("#") and len(columns := line.strip("# ").replace(",", " ").split()) == 8:
+            require_order(columns[1:], "xyzxyzw", files[0])
     stamps = [stamp_ns(float(each), str(files[0])) for each in rows[:, 0]]
     return trajectory_of(stamps, rows[:, 1:], files[0])
 
