@@ -114,13 +114,14 @@ def scene_render(
     from advnerf_core.data.transforms import load_transforms
     from advnerf_core.files import refuse_overwriting
     from advnerf_core.splats.scene_file import load_renderer
-    from nodes.lab.scene_training import render
+    from nodes.lab.scene_training import render, rendered_files
     from nodes.runtime.progress import ProgressDisplay
 
     renderer = load_renderer(scene, interval_scale)
     listed = load_transforms(transforms)
-    refuse_overwriting([scene, *listed.files], [] if video is None else [video])
+    inputs = [scene, *listed.files]
     listed = listed.training_and_held_out(every)[1] if held_out else listed.sorted_by_name()
+    refuse_overwriting(inputs, [*rendered_files(listed, output), *([] if video is None else [video])])
     with ProgressDisplay() as display:
         count = render(renderer, listed, size, output, video, display.start("render"))
     print(f"{count} views in {output}" + ("" if video is None else f", and {video}"))

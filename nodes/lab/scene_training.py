@@ -136,23 +136,29 @@ def render(
     Returns:
         The number of views.
     """
-    loaded = listed.load(size)
+    loaded, views = listed.load(size), rendered_files(listed, output)
     frames: list[NDArray[np.uint8]] = []
     for index, (pose, pinhole) in enumerate(zip(loaded.T_world_from_camera, loaded.pinholes, strict=True)):
         rgb, depth_m, alpha = renderer.render(pose[None], pinhole)
         picture = np.rint(255 * rgb[0].numpy()).astype(np.uint8)
-        name = listed.frames[index].path.stem
+        file = views[index]
         if renderer.config.learned_background:
-            _write_png(output / f"{index:04d}_{name}.png", picture[..., ::-1])
+            _write_png(file, picture[..., ::-1])
         else:
-            _write_png(output / f"{index:04d}_{name}.png", _with_alpha(rgb[0].numpy(), alpha[0].numpy()))
+            _write_png(file, _with_alpha(rgb[0].numpy(), alpha[0].numpy()))
         depth_mm = np.nan_to_num(MM_PER_M * depth_m[0].numpy(), posinf=0.0)
-        _write_png(output / f"{index:04d}_{name}_depth_mm.png", np.clip(depth_mm, 0, 65535).astype(np.uint16))
+        depth_file = file.with_name(f"{file.stem}_depth_mm.png")
+        _write_png(depth_file, np.clip(depth_mm, 0, 65535).astype(np.uint16))
         frames.append(picture)
-        report((index + 1) / len(loaded.rgb), name)
+        report((index + 1) / len(loaded.rgb), file.stem)
     if video is not None:
         write_video(video, frames)
     return len(frames)
+
+
+def rendered_files(listed: PosedImages, output: Path) -> list[Path]:
+    """Files of the colour images that `render` writes, in the order of the images."""
+    return [output / f"{index:04d}_{frame.path.stem}.png" for index, frame in enumerate(listed.frames)]
 
 
 def write_video(path: Path, frames: Sequence[NDArray[np.uint8]]) -> None:

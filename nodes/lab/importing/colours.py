@@ -52,12 +52,12 @@ def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourM
         ImportRecordingError: The frames do not show the scene.
         PlaceError: The output is a file of the images.
     """
+    listed = load_transforms(images)
+    refuse_overwriting(listed.files, [output])
     if is_splat_scene(scene):
         raise ImportRecordingError(
             f"expected a scene that was learned, got the splat {scene}, which has no colour map; train one with advnerf scene train"
         )
-    listed = load_transforms(images)
-    refuse_overwriting(listed.files, [output])
     frames = listed.with_frames(thinned(list(listed.frames), most)).load()
     field, occupied, metadata = load_scene(scene)
     # Do not apply the map of an earlier fit.

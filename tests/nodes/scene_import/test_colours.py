@@ -76,8 +76,9 @@ def test_frames_that_look_past_the_scene_are_refused(tmp_path, scene):
         match_colours(scene, images, scene, 4)
 
 
-def test_a_splat_has_no_colour_map(tmp_path):
+def test_a_splat_has_no_colour_map(tmp_path, scene):
+    images = frames_of(scene, tmp_path, INSIDE[:1])
     splat = tmp_path / "splat.safetensors"
     save_splat_scene(splat, SplatRenderer(room(60), box=((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))))
     with pytest.raises(ImportRecordingError, match=r"expected a scene that was learned, got the splat"):
-        match_colours(splat, tmp_path / "transforms_car.json", splat, 4)
+        match_colours(splat, images, splat, 4)

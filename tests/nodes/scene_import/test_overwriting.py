@@ -27,6 +27,7 @@ def content(folder):
         "from-splat a.ply -o set/transforms.json --images set",
         "render s.safetensors set -o views --video s.safetensors",
         "render s.safetensors set -o views --video set/images/0.png",
+        "render s.safetensors set -o views --video views/0000_0.png",
         "match-colours s.safetensors set -o set/transforms.json",
         "object build mesh.obj -o mesh.obj --unit m",
         "object build --images set -o set/images/1.png",
@@ -50,7 +51,8 @@ def test_an_input_is_never_overwritten(tmp_path, monkeypatch, capsys, words):
     assert advnerf(monkeypatch, "scene", *words.split()) == 2
     error = capsys.readouterr().err
     assert re.search(
-        "would be overwritten; choose another|expected an --output that is not the scan itself", error
+        "would be overwritten; choose another|expected an --output that is not the scan itself|expected names for two files",
+        error,
     )
     assert error.count("\n") == 1
     assert content(tmp_path) == before
