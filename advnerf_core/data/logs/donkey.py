@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,8 +54,18 @@ def read_tub(path: Path, choice: LogChoice) -> DriveLog:
         sorted({key for each in records for key in each.values if key.startswith("cam/")}, key=_camera_order)
     )
     images = chosen_name(choice.images, cameras, "images", path)
-    name = choice.steering or _STEERING
     driven = [each for each in records if each.values.get(_MODE, "user") == "user"]
+    controls = tuple(
+        sorted(
+            {
+                key
+                for each in (driven or records)
+                for key, value in each.values.items()
+                if _is_control(key, value)
+            }
+        )
+    )
+    name = _STEERING if choice.steering is None else chosen_name(choice.steering, controls, "steering", path)
     left_out |= {_PILOT: len(records) - len(driven)} if len(driven) < len(records) else {}
     values = _values(driven, name, images)
     times_s = [1e-3 * each.time_ms for each in driven]
@@ -74,9 +85,7 @@ def read_tub(path: Path, choice: LogChoice) -> DriveLog:
         (*files, *(each.folder / str(each.values[images]) for each in driven)),
         images,
         cameras,
-        tuple(
-            sorted({key for each in driven for key, value in each.values.items() if _is_control(key, value)})
-        ),
+        controls,
         SteeringUnit(name, None, "right").chosen(choice) if np.isfinite(values).any() else None,
         len(driven),
         median_rate_hz(times_s),
@@ -96,8 +105,13 @@ def _version_2(path: Path) -> tuple[tuple[list[_Record], tuple[Path, ...]], dict
             f"{manifest}: expected the catalogs ('paths') in its last line, got none; copy the tub again, "
             "or repair it with Donkeycar"
         )
-    deleted = {index for index in state.get("deleted_indexes", ()) if isinstance(index, int)}
-    catalogs = [path / str(name) for name in state["paths"]]
+    deleted = _deleted(f"{manifest}: deleted_indexes", state.get("deleted_indexes", []))
+    names = [str(name) for name in state["paths"]]
+    if repeated := sorted(name for name, count in Counter(names).items() if count > 1):
+        raise LogError(
+            f"{manifest}: paths: expected each catalog once, got {', '.join(repeated)} again; remove it"
+        )
+    catalogs = [path / name for name in names]
     counts: Counter[str] = Counter()
     records = []
     for place, values in (row for catalog in catalogs for row in read_json_lines(catalog)):
@@ -114,7 +128,7 @@ def _version_1(path: Path) -> tuple[tuple[list[_Record], tuple[Path, ...]], dict
         (int(match[1]), file) for file in path.iterdir() if (match := _RECORD.fullmatch(file.name))
     )
     exclude = path / "exclude.json"
-    excluded = set(read_json(exclude)) if exclude.is_file() else set()
+    excluded = _deleted(str(exclude), read_json(exclude)) if exclude.is_file() else set()
     kept = [file for number, file in numbered if number not in excluded]
     records = [
         _Record(str(file), values, path, _time_ms(values.get("milliseconds")))
@@ -123,6 +137,15 @@ def _version_1(path: Path) -> tuple[tuple[list[_Record], tuple[Path, ...]], dict
     ]
     files = tuple(file for _, file in numbered)
     return (records, files), ({_DELETED: len(files) - len(kept)} if len(kept) < len(files) else {})
+
+
+def _deleted(place: str, found: Any) -> set[int]:
+    """Numbers of records that were deleted: one that is misread would bring its record back."""
+    if not isinstance(found, list) or not all(type(each) is int for each in found):
+        raise LogError(
+            f"{place}: expected the numbers of deleted records, such as [4, 5], got {found!r:.60}; correct it"
+        )
+    return set(found)
 
 
 def _object(place: str, values: Any) -> dict[str, Any]:
@@ -137,8 +160,8 @@ def _values(records: list[_Record], name: str, images: str) -> NDArray[np.float6
     is_recorded = name != _STEERING or any(name in each.values for each in records)
     for each in records:
         value = each.values.get(name)
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        values.append(float(value) if isinstance(value, int | float) else math.nan)
+        is_number = _is_number(value)
+        values.append(float(value) if is_number else math.nan)
         if is_recorded and not is_number:
             problems.append(f"{each.place}: {name}: expected a number, got {value!r:.40}; delete the record")
         elif is_number and name == _STEERING and abs(values[-1]) > _WIDEST:
@@ -150,12 +173,17 @@ def _values(records: list[_Record], name: str, images: str) -> NDArray[np.float6
 
 
 def _is_control(key: str, value: Any) -> bool:
-    return "/" in key and isinstance(value, int | float) and not isinstance(value, bool)
+    return "/" in key and _is_number(value)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number that a float can hold: JSON's integers have no end."""
+    return isinstance(value, float) or (type(value) is int and abs(value) <= sys.float_info.max)
 
 
 def _time_ms(value: Any) -> float:
     """A time [ms]; NaN without one, or for a number that is no time."""
-    return float(value) if isinstance(value, int | float) and abs(value) < _LATEST_MS else math.nan
+    return float(value) if _is_number(value) and abs(value) < _LATEST_MS else math.nan
 
 
 def _camera_order(name: str) -> tuple[bool, str]:

@@ -143,9 +143,23 @@ def test_which_number_of_a_lerobot_data_set_is_the_steering_is_not_guessed(tmp_p
     assert radians.unit.unknown == "--steering-positive"
 
 
+def test_a_misspelt_steering_of_a_tub_is_answered_with_its_names(tmp_path):
+    folder = write_tub_2(tmp_path / "log")
+    with pytest.raises(
+        LogError, match=r"expected steering user/angel in .*, it has user/angle, user/throttle"
+    ):
+        open_log(folder, LogChoice(steering="user/angel"))
+
+
 def cut(file, share=0.5):
     content = file.read_bytes()
     file.write_bytes(content[: int(share * len(content))])
+
+
+def edit(file, values):
+    """Replace values of the object in the last line of a file."""
+    *before, last = file.read_text().strip().split("\n")
+    file.write_text("\n".join([*before, json.dumps(json.loads(last) | values)]))
 
 
 DAMAGED = {
@@ -156,6 +170,11 @@ DAMAGED = {
     "a damaged image": ("tub 2", lambda f: cut(f / "images/3_cam_image_array_.jpg"), r"catalog_0\.catalog:4: expected a readable image"),
     "a record that was cut": ("tub 1", lambda f: cut(f / "record_4.json"), r"record_4\.json:1: expected valid JSON"),
     "a record without an angle": ("tub 1", lambda f: (f / "record_4.json").write_text('{"cam/image_array": "4_cam-image_array_.jpg"}'), "user/angle: expected a number, got None"),
+    "an angle that no float holds": ("tub 1", lambda f: edit(f / "record_4.json", {"user/angle": 10**400}), "user/angle: expected a number, got 1000"),
+    "deleted records as text": ("tub 2", lambda f: edit(f / "manifest.json", {"deleted_indexes": ["4"]}), r"manifest\.json: deleted_indexes: expected the numbers of deleted records"),
+    "no list of deleted records": ("tub 2", lambda f: edit(f / "manifest.json", {"deleted_indexes": None}), "such as .4, 5., got None"),
+    "excluded records in objects": ("tub 1", lambda f: (f / "exclude.json").write_text('[{"a": 1}]'), r"exclude\.json: expected the numbers of deleted records"),
+    "a catalog named twice": ("tub 2", lambda f: edit(f / "manifest.json", {"paths": ["catalog_0.catalog"] * 2}), r"expected each catalog once, got catalog_0\.catalog again"),
     "a row that was cut": ("udacity", lambda f: cut(f / "driving_log.csv", 0.97), r"driving_log\.csv:13: "),
     "rows without images": ("udacity", lambda f: [each.unlink() for each in (f / "IMG").glob("*")], r"driving_log\.csv:2: center: expected an image, found no file"),
     "a table that was cut": ("lerobot 3", lambda f: cut(f / "data/chunk-000/file-000.parquet"), r"file-000\.parquet: expected a Parquet file"),
