@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.data.logs.choice import LogChoice
+from advnerf_core.data.logs.choice import LogChoice, LogError
 from advnerf_core.data.logs.drive_log import (
     NOWHERE,
     DriveLog,
@@ -42,6 +42,7 @@ _SAFETY, _SENT, _EXPERT = "/safety/state", "/motor/sent", "/expert/state"
 _IMAGES = ("/compositor/image", *CAMERA_TOPICS)
 _ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 _JOIN_S = 0.12
+_MOST_BACK_S = 1.0  # messages of one topic may overtake each other, but no clock of a drive goes back
 _TIMED = 200  # images from which the rate is determined
 _STAMPS = 8  # messages that show whether a topic is stamped
 _Time = Callable[[BagMessage, Any], int]
@@ -169,16 +170,28 @@ def _recorded_ns(message: BagMessage, decoded: Any) -> int:
     return message.log_ns
 
 
+def _refuse_going_back(latest_ns: int, stamp_ns: int, place: str) -> None:
+    """Two drives whose stamps overlap cannot be told apart: an image would be joined with the steering of the other one."""
+    if (back_s := (latest_ns - stamp_ns) / NS_PER_S) > _MOST_BACK_S:
+        raise LogError(
+            f"{place}: expected stamps that go forward, got one {back_s:.3g} s before an earlier one; "
+            "cut the bag there, or record again with one clock"
+        )
+
+
 def _frames(bag: Path, images: str, track: _Track, time_ns: _Time) -> Iterator[LogFrame]:
+    latest_ns: int | None = None
     for number, message in enumerate(read_messages(bag, [images], types={images: IMAGE_TYPE})):
         image = decode(IMAGE_TYPE, message.cdr)
-        stamp_ns = time_ns(message, image)
+        stamp_ns, place = time_ns(message, image), f"{bag}, image {number}"
+        latest_ns = stamp_ns if latest_ns is None else max(latest_ns, stamp_ns)
+        _refuse_going_back(latest_ns, stamp_ns, place)
         steering_rad, speed_mps = track.command(stamp_ns)
         yield LogFrame(
             rgb_image(image, f"{images} in {bag}"),
             stamp_ns,
             steering_rad,
-            f"{bag}, image {number}",
+            place,
             speed_mps,
             track.state(stamp_ns),
             "" if track.is_armed(stamp_ns) else "not armed",

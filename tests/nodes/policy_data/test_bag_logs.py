@@ -104,13 +104,14 @@ def test_an_export_has_an_episode_for_each_drive_and_never_replaces_one(tmp_path
     assert sorted(each.name for each in tmp_path.iterdir()) == ["bag", "set", "two"]
 
 
-def write_ackermann(path, form, topics=("/drive",), unstamped=(), late_ns=1000, step=0.02, count=6):
+def write_ackermann(path, form, topics=("/drive",), unstamped=(), late_ns=1000, step=0.02, count=6, back_s=0):
     """A bag of other software: images, and commands of a car.
 
     Args:
         unstamped: Topics whose stamps are all zero.
         late_ns: From an image to the recording of its command, and, in another clock, to its stamp [ns].
         step: Steering of an image above that of the one before.
+        back_s: How far the clock of all stamps jumps back before the fourth image [s].
     """
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
@@ -133,11 +134,12 @@ def write_ackermann(path, form, topics=("/drive",), unstamped=(), late_ns=1000, 
             t = image.header.stamp.sec * 10**9 + image.header.stamp.nanosec
             if "/front/image" in unstamped:
                 image.header.stamp.sec = image.header.stamp.nanosec = 0
+            image.header.stamp.sec -= back_s if k >= 3 else 0
             writer.write(images, t, pack(image, IMAGE))
             for topic, drive in zip(topics, drives, strict=True):
                 command = store.types[DRIVE](step * k, 0.0, 1.5, 0.0, 0.0)
                 message = store.types[ACKERMANN](header=make.header(k, "car"), drive=command)
-                message.header.stamp.sec += late_ns // 10**9
+                message.header.stamp.sec += late_ns // 10**9 - (back_s if k >= 3 else 0)
                 if topic in unstamped:
                     message.header.stamp.sec = message.header.stamp.nanosec = 0
                 writer.write(drive, t + late_ns, pack(message, ACKERMANN))
@@ -165,6 +167,14 @@ def test_what_has_no_stamps_is_joined_by_the_times_of_recording(tmp_path, unstam
     assert log.joined_by == f"times of recording, as all stamps on {' and '.join(unstamped)} are equal"
     assert [frame.steering for frame in log.frames()] == pytest.approx([0.02 * k for k in range(6)])
     assert log.labels == "recorded"  # without poses there is no expert
+
+
+def test_two_drives_whose_stamps_overlap_are_not_joined_with_each_other(tmp_path):
+    log = open_log(write_ackermann(tmp_path / "drive", "ros2", back_s=2))
+    with pytest.raises(
+        LogError, match=r"drive, image 3: expected stamps that go forward, got one 1\.9 s before"
+    ):
+        list(log.frames())
 
 
 @pytest.mark.parametrize(
