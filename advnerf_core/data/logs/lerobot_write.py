@@ -38,6 +38,7 @@ _QUALITY = "5"  # x264's constant rate factor: errors of a level of 256, as roun
 _KEYFRAME_EVERY = "10"  # training reads frames in any order
 _LEAST_IMAGES = 4
 _STATISTICS_OF = 200
+_FASTEST_HZ = 1000  # faster are only times in another unit
 
 Report = Callable[[int], None]
 
@@ -96,12 +97,12 @@ def write_lerobot(
 
 
 def _rate_of(log: DriveLog) -> int:
-    if not log.rate_hz >= 0.5:
+    if not 0.5 <= log.rate_hz <= _FASTEST_HZ:
         found = (
             "none" if math.isnan(log.rate_hz) else f"{log.rate_hz:.2g} Hz" if log.rate_hz else TIMES_GO_BACK
         )
         raise LogError(
-            f"expected times of the images of at least 0.5 Hz in {log.path}, got {found}; give the images per second with --rate"
+            f"expected times of the images of 0.5 to {_FASTEST_HZ} Hz in {log.path}, got {found}; give the images per second with --rate"
         )
     return round(log.rate_hz)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.data.logs.choice import LogChoice, LogError, LogRequest
+from advnerf_core.data.logs.lerobot_write import write_lerobot
 from advnerf_core.errors import AdvnerfError, ConfigError
 from nodes.lab.policy_data.frames import frames_of, view_for_size
 from nodes.lab.policy_data.log_facts import read_facts
@@ -95,8 +96,10 @@ def test_a_udacity_log_is_read_as_it_was_downloaded(tmp_path, header, prefix):
 def test_one_log_under_two_spellings_is_refused_and_two_cameras_of_it_are_not(tmp_path, form):
     folder = FORMATS[form](tmp_path / "log")
     (tmp_path / "link").symlink_to(folder)
+    if form == "udacity":
+        folder /= "driving_log.csv"
     common = LogChoice(steering_full_rad=0.4)
-    with pytest.raises(LogError, match=r"every log once.* got .*/log and .*/link, which are the same"):
+    with pytest.raises(LogError, match=r"every log once.* got .*/log\S* and .*/link, which are the same"):
         open_logs([LogRequest(folder), LogRequest(tmp_path / "link")], common)
     assert len(open_logs([LogRequest(folder), LogRequest(folder, "steering-offset-rad=-0.1")], common)) == 2
 
@@ -149,6 +152,15 @@ def test_a_misspelt_steering_of_a_tub_is_answered_with_its_names(tmp_path):
         LogError, match=r"expected steering user/angel in .*, it has user/angle, user/throttle"
     ):
         open_log(folder, LogChoice(steering="user/angel"))
+
+
+def test_the_images_of_a_log_in_seconds_are_not_exported_as_milliseconds(tmp_path):
+    folder = write_tub_2(tmp_path / "log", step_ms=0.1)
+    with pytest.raises(
+        LogError, match=r"expected times of the images of 0\.5 to 1000 Hz in .*, got 1e\+04 Hz"
+    ):
+        write_lerobot(open_log(folder, LogChoice(steering_full_rad=0.4)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def cut(file, share=0.5):
