@@ -12,7 +12,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,7 +161,7 @@ def _values(records: list[_Record], name: str, images: str) -> NDArray[np.float6
     for each in records:
         value = each.values.get(name)
         is_number = _is_number(value)
-        values.append(float(value) if is_number else math.nan)
+        values.append(float(value) if _is_number(value) else math.nan)
         if is_recorded and not is_number:
             problems.append(f"{each.place}: {name}: expected a number, got {value!r:.40}; delete the record")
         elif is_number and name == _STEERING and abs(values[-1]) > _WIDEST:
@@ -176,7 +176,7 @@ def _is_control(key: str, value: Any) -> bool:
     return "/" in key and _is_number(value)
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: Any) -> TypeGuard[float]:
     """Whether a value is a number that a float can hold: JSON's integers have no end."""
     return isinstance(value, float) or (type(value) is int and abs(value) <= sys.float_info.max)
 
