@@ -9,7 +9,7 @@ from nodes.experiment.run.set_film import MOST_BYTES
 
 ROOT = Path(__file__).parents[1]
 # 45 MB; paper_car: scenes and victims of two places 19 MB, drives and textures of its 106 cells 16 MB; paper_junction: its build 20 MB, and
-# 28 MB for its 147 cells, of which 82 are there with 17 MB.
+# 28 MB for its 147 cells.
 MOST_TRACKED_BYTES = 128_000_000
 
 

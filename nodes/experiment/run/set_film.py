@@ -20,14 +20,15 @@ from advnerf_core.report.evidence.verifying.layout import SET
 from nodes.experiment.show.context import Experiment
 
 MOST_BYTES = 180_000
-_WIDTH_PX, _FRAME_MS, _QUALITIES = 760, 200, (70, 50, 35, 20, 10)
+_WIDTH_PX, _FRAME_MS, _QUALITIES = 760, 200, (70, 50, 35, 20, 10, 5)
 _EVERY = 2  # frames, at ten frames a second
 
 
 def write_film(experiment: Experiment, published: Path) -> Path | None:
-    """Write the film of the first primary test beside the page; None without a test, or if a clip is not on this machine."""
+    """Write the film of the primary test with the largest difference beside the page; None without a test, or if a clip is not on this machine."""
     primary = read_json(published / SET)["primary"]
-    clips = _clips(experiment, published, primary[0]) if primary else []
+    shown = max(primary, key=lambda test: test["difference_m"] or 0.0, default=None)
+    clips = _clips(experiment, published, shown) if shown else []
     if not clips or not all(clip.exists() for clip in clips):
         return None
     frames = _side_by_side([read_clip(clip)[::_EVERY] for clip in clips])
