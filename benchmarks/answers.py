@@ -24,7 +24,6 @@ from advnerf_core.report.evidence.words import (
 )
 from advnerf_core.report.reference import DOMAINS
 from benchmarks.strongest import strongest_random
-from nodes.experiment.plan.victims import NAIVE
 
 # Worlds that this project did not write, or did not draw, by what the names of their sets contain.
 _FOREIGN = {
@@ -201,16 +200,11 @@ def _victims(sets: Sequence[Mapping[str, Any]], published: Path) -> str:
     off = max(found, key=lambda each: each.deployed.off_track / each.deployed.drives)
     place = next(name for name, each in named if each is off)
     whom = "them" if len(titles) == 1 else "those trained with textures"
-    untrained = (
-        ""
-        if NAIVE in titles
-        else " Results with a policy that never saw a texture are of the [first build](results/first_build.md)."
-    )
     return (
         f"Policies {' or '.join(titles)}. The best random search of each set moves {whom} {min(each.deployed.best_m for each in found):.3f} to "
         f"{worst.deployed.best_m:.3f} m per tick where it is deployed (set {place}: {off.deployed.off_track} of {off.deployed.drives} drives off the track, "
         f"{off.deployed.all_off_track} of {off.deployed.all_drives} of all {off.searches} searches), and up to "
-        f"{max(each.surrogate.best_m for each in found):.3f} m in the learned scene.{untrained}"
+        f"{max(each.surrogate.best_m for each in found):.3f} m in the learned scene."
     )
 
 

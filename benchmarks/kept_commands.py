@@ -11,7 +11,7 @@ from advnerf_core.report.evidence.registration import launch_file
 
 # Name of what computes the rows again, and the commands; groups are its arguments.
 KEPT_COMMANDS: dict[str, re.Pattern[str]] = {
-    "table": re.compile(r"advnerf (?:experiment|predict) (launch/(?:paper|meshes|poses)\.experiment\.yaml)"),
+    "table": re.compile(r"advnerf experiment (launch/(?:meshes|poses)\.experiment\.yaml)"),
     "retraining": re.compile(
         r"advnerf experiment (launch/junction\.experiment\.yaml) --setting (retrain) --run-folder (\S+)"
     ),

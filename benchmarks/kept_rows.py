@@ -19,7 +19,7 @@ _COMPARED = ("value", "unit", "target", "met", "note")
 
 
 def table_rows(file: str) -> list[LedgerRow]:
-    """Rows of an experiment's table, targets, gate and predictions."""
+    """Rows of an experiment's table, targets and gate."""
     found = transfer_table.ledger_rows(REPOSITORY / file, PUBLISHED / Path(file).name.split(".")[0])
     return [row.with_command(row.command.replace(str(REPOSITORY / file), file)) for row in found]
 

@@ -102,13 +102,6 @@ QUESTIONS = (
         ("hardening",),
     ),
     Question(
-        "junction",
-        "Does an attack found in the learned junction work there?",
-        "The paper's transfer experiment: objects beside three paths, searched in the learned scene, driven in the world itself.",
-        ("advnerf experiment launch/paper", "advnerf predict launch/paper"),
-        lost=True,
-    ),
-    Question(
         "places_and_meshes",
         "Do places, mesh textures and mesh shapes work as attacks?",
         "The same transfer experiment over other spaces of search.",

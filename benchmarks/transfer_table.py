@@ -1,4 +1,4 @@
-"""Question: what did the experiments of the first build show? ``python -m benchmarks.transfer_table [FILE]``.
+"""Question: what did the experiments of the first build show? ``python -m benchmarks.transfer_table FILE``.
 
 Their cells in ``docs/results`` kept totals and no drives, some not even the number of ticks, so their rows of the ledger are ratios of total
 CTE to that past the plain object, as they were recorded. Tables and pages of today are in metres.
@@ -19,18 +19,15 @@ from advnerf_core.report.conditions import style_of
 from advnerf_core.report.reference import DOMAINS, Domain, Limit
 from advnerf_core.report.result_table import ResultTable, TableRow
 from advnerf_core.report.targets import Target, evaluate
-from benchmarks.first_build_ratios import paper_ratio, seeds_interval, skill_text, transfer_ratio
+from benchmarks.first_build_ratios import seeds_interval, transfer_ratio
 from benchmarks.results import LedgerRow
 from nodes.experiment.run.admission import gate_file, gate_key
 from nodes.experiment.run.plan import PUBLISHED
-from nodes.experiment.run.predictions import prediction_file
 from nodes.experiment.run.published import published_table
 from nodes.experiment.steps.run import load_experiment
 
 VICTIM = "hardened"
-FILE = Path("launch/paper.experiment.yaml")
 # Of targets that are missed: what was tried, and what it points to.
-_SMALL_BASE = "tried: the victim has learned from random textures; nothing was tuned after the first drive; points to the base: "
 _SHAPES = (
     "tried: bounds of 0.5 and 1 m, balls as in the paper, 50 iterations (after 30 of them 5 to 9 % of the gain are to come); points to the start poses: those of "
     "seeds 1 and 2 are drawn and cost metres without any attack, so the ratio of seed 0, from the nominal start, is the largest"
@@ -41,18 +38,7 @@ _BALLS = (
 )
 # Of three seeds the 27 resamples have the extreme seed alone more often than 2.5 %: the interval ends at the extremes.
 _RANGE_SEEDS = 3
-# What the ledger calls measures that are no ratio.
-_MEASURES = {
-    "spread": "std / mean",
-    "off_track": "drives off the track",
-    "off_track_share": "share of drives off the track",
-}
 MISSED: dict[tuple[str, str], str] = {
-    ("straight", "random"): _SMALL_BASE + "the undisturbed car is that exact",
-    ("green_screen", "random"): _SMALL_BASE + "the undisturbed car is that exact",
-    ("monitor", "random"): _SMALL_BASE + "the undisturbed car is that exact",
-    ("monitor", "gradient"): "tried: the screen was placed anew before any live drive, nearer and on the board's line of sight; points to its "
-    "stand: every attacked car steers into it before it is off the track",
     ("straight_shape_1m", "gradient"): _SHAPES, ("straight_shape_05m", "gradient"): _SHAPES, ("straight_balls_05m", "gradient"): _BALLS,
 }  # fmt: skip
 
@@ -98,8 +84,6 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
         parts.append(
             f"transfer ratio {transfer:.2f}" + (", from the same start" if starts_differ(cells) else "")
         )
-    if (paper := paper_ratio(row.scenario, row.domain, row.method)) is not None:
-        parts.append(f"paper {paper:.2f} x its deployed drive without attack")
     return "; ".join(parts)
 
 
@@ -143,15 +127,11 @@ def builds_of(cells: Sequence[CellResult]) -> int:
     return len({tuple(sorted(cell.stages.items())) for cell in cells})
 
 
-def why_missed(target: Target | None, row: TableRow, cells: Sequence[CellResult]) -> str:
-    """By how much a target is missed, what that is on the road, what was tried and what it points to; empty where it is met."""
+def why_missed(target: Target | None, row: TableRow) -> str:
+    """By how much a target is missed, what was tried and what it points to; empty where it is met."""
     if target is None or target.met is not False or row.total_m is None:
         return ""
     text = f"; {target.verdict}"
-    ticks = cells[0].ticks if cells else 0
-    if ticks and row.method == "random":
-        off_mm, clean_mm = (1000 * each / ticks for each in (row.total_m, base_m(cells, row.domain)))
-        text += f": {off_mm:.0f} mm off the path on average, {clean_mm:.0f} mm without attack"
     said = MISSED.get((row.scenario, row.method), "")
     return f"{text}; {said}" if said else text
 
@@ -170,16 +150,6 @@ def ratios_of(cells: Sequence[CellResult], domain: Domain) -> list[float]:
 def base_m(cells: Sequence[CellResult], domain: Domain) -> float:
     """Mean total CTE of the same starts without attack [m]."""
     return float(np.mean([np.mean(drives.none_total_cte_m) for drives in drives_of(cells, domain)]))
-
-
-def how_far(cells: Sequence[CellResult]) -> str:
-    """How far off live drives came, beside the distance that counts, and how many ended at an obstacle; empty for other cells."""
-    far = [cell.extra for cell in cells if "max_abs_cte_m" in cell.extra]
-    if not far:
-        return ""
-    ran = sum(any(cell.obstacles("deployed")) for cell in cells)
-    text = f"; at most {max(each['max_abs_cte_m'] for each in far):.2f} m off the path, off-track is beyond {far[0]['off_track_m']:.2f} m"
-    return text + (f"; ran into an obstacle, which held it there, in {ran} of {len(cells)}" if ran else "")
 
 
 def rows_of(table: ResultTable, limits: Sequence[Limit]) -> list[tuple[TableRow, str, Target | None]]:
@@ -209,7 +179,7 @@ def judged(table: ResultTable, limit: Limit) -> tuple[str, Target | None]:
         if limit.at_most is not None
         else ""
     )
-    return limit.said or bound or (target.target if target else ""), target
+    return bound or (target.target if target else ""), target
 
 
 def gate_rows(
@@ -233,22 +203,8 @@ def gate_rows(
     return rows
 
 
-def skill_rows(folder: Path, cells: Sequence[CellResult], file: str) -> list[LedgerRow]:
-    """How good the predictions of transfer were, and how alike pictures are along the deployed drives without attack."""
-    if (found := skill_text(folder, cells)) is None:
-        return []
-    factor, text, names = found
-    clean = [read_json(prediction_file(folder, name))["clean_drive"] for name in names]
-    views = (
-        f"along the drives without attack PSNR {min(c['psnr_db'] for c in clean):.1f} to {max(c['psnr_db'] for c in clean):.1f} dB, "
-        f"steering differs by at most {max(c['steering'] for c in clean):.4f} on average"
-    )
-    line, command = "predicted against deployed ratio, median factor", f"advnerf predict {file}"
-    return [LedgerRow(line, factor, "x", "", None, command, f"{text} {views}", **measured_where(cells))]
-
-
 def ledger_rows(file: Path, folder: Path | None = None) -> list[LedgerRow]:
-    """Rows of the ledger for an experiment's published table, its other targets, its gate and its predictions.
+    """Rows of the ledger for an experiment's published table and its gate.
 
     Args:
         file: Of the experiment, relative to the project: which lines and seeds there should be.
@@ -260,44 +216,23 @@ def ledger_rows(file: Path, folder: Path | None = None) -> list[LedgerRow]:
     limits, found = experiment.held_to.targets, []
     for row, said, target in rows_of(table, limits):
         cells = cells_of(table, row)
-        note = note_of(row, cells) + why_missed(target, row, cells)
-        note += how_far(cells) if row.domain == "deployed" else ""
+        note = note_of(row, cells) + why_missed(target, row)
         limit, met = (f"{said} x", target.met) if target else ("", None)
         line = line_of(row, cells)
         found.append(
             LedgerRow(line, row.ratio or 0.0, "x no attack", limit, met, run, note, **measured_where(cells))
         )
-    found += _other_targets(table, limits, run)
     for key, told in gate_rows(folder, sorted({gate_key(cell) for cell in experiment.cells})):
         where = measured_where([cell for cell in table.cells.values() if gate_key(cell) == key])
         line, psnr_db, unit, passes, passed, note = told
         found.append(LedgerRow(line, psnr_db, unit, passes, passed, run, note, **where))
-    predicted_cells = [cell for cell in table.cells.values() if prediction_file(folder, cell.name).exists()]
-    return [*found, *skill_rows(folder, predicted_cells, str(file))]
-
-
-def _other_targets(table: ResultTable, limits: Sequence[Limit], run: str) -> list[LedgerRow]:
-    """Rows of targets that are not on a ratio."""
-    found = []
-    for limit in limits:
-        said, target = judged(table, limit)
-        row = table.find(limit.scenario, limit.victim, limit.method, limit.domain)
-        if limit.of == "ratio" or row is None or target is None or target.value is None:
-            continue
-        measure, cells = _MEASURES[limit.of], cells_of(table, row)
-        line = f"{limit.scenario}, {style_of(limit.method).title}, {limit.domain}: {measure}"
-        note = f"{len(row.seeds)} seeds" + (how_far(cells) if "off the track" in measure else "")
-        note += why_missed(target, row, cells)
-        found.append(LedgerRow(line, target.value, "", said, target.met, run, note, **measured_where(cells)))
     return found
 
 
 def main() -> None:
-    """Record the rows of the published table, and its other targets."""
+    """Record the rows of the published table."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument(
-        "file", type=Path, nargs="?", default=FILE, help="which lines and seeds there should be"
-    )
+    parser.add_argument("file", type=Path, help="which lines and seeds there should be")
     parser.add_argument("--folder", type=Path, help="of the published cells; docs/results/NAME if not given")
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()

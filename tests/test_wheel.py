@@ -77,7 +77,6 @@ print(json.dumps({
     "packages": [each.__file__ for each in (advnerf_core, calibration, hardware, nodes)],
     "launches": {name: str(named_file(name, "launch")) for name in launches},
     "room": str(named_file("room", "experiment")),
-    "paper": str(named_file("paper", "experiment")),
     "camera": plan.documents["camera"].data["calibration"],
     "reference": len(list(REFERENCE.shipped.iterdir())),
 }))
@@ -101,7 +100,6 @@ def test_names_are_found_in_it_from_an_empty_folder(unpacked, tmp_path):
     launch = unpacked / "nodes" / "shipped" / "launch"
     assert found["launches"] == {name: str(launch / f"{name}.launch.yaml") for name in names}
     assert Path(found["room"]) == launch / "room.experiment.yaml"
-    assert Path(found["paper"]) == launch / "paper.experiment.yaml"
     assert Path(found["camera"]) == unpacked / "calibration" / "twin" / "camera.yaml"
     assert found["reference"] == len(list((ROOT / "docs" / "results" / "reference").iterdir()))
 

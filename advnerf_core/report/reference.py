@@ -11,7 +11,7 @@ from advnerf_core.strict import StrictModel
 Domain = Literal["surrogate", "deployed"]
 DOMAINS: tuple[Domain, ...] = get_args(Domain)
 # Measures of drives, which a limit names a method for.
-DriveMeasure = Literal["excess_m", "ratio", "mean_abs_cte_m", "spread", "off_track", "off_track_share"]
+DriveMeasure = Literal["excess_m", "ratio", "mean_abs_cte_m", "off_track", "off_track_share"]
 LiveMeasure = Literal[
     "laps",
     "laps_mean_abs_cte_m",
@@ -30,8 +30,8 @@ class Limit(StrictModel):
 
     Attributes:
         of: The measure. ``excess_m`` is the excess |CTE| per tick over the plain object, ``ratio`` the total CTE over that past the plain
-            object (publications in other units give this), ``mean_abs_cte_m`` per tick, ``spread`` the standard deviation of the total over
-            its mean, ``memory_ratio`` the peak memory of the adjoint over 400 ticks against that over 50.
+            object (publications in other units give this), ``mean_abs_cte_m`` per tick, ``memory_ratio`` the peak memory of the adjoint
+            over 400 ticks against that over 50.
         what: Title of the measure; empty to derive it from the keys.
         scenario: Scenario of the drives; empty for the first one.
         victim: Victim of the drives.
@@ -40,7 +40,6 @@ class Limit(StrictModel):
         at_least: Smallest value.
         at_most: Largest value.
         above: Another method, whose value must be exceeded.
-        said: The limit as text; empty for the plain number.
         paper: The publication's value, as text.
     """
 
@@ -53,7 +52,6 @@ class Limit(StrictModel):
     at_least: float | None = None
     at_most: float | None = None
     above: str = ""
-    said: str = ""
     paper: str = ""
 
     @property

@@ -46,11 +46,6 @@ class TableRow(RowOf):
         return self.total_m / self.plain_total_m if self.total_m is not None and self.plain_total_m else None
 
     @property
-    def spread(self) -> float | None:
-        """Standard deviation over mean of the total CTE."""
-        return self.total_std_m / self.total_m if self.total_std_m is not None and self.total_m else None
-
-    @property
     def mean_abs_cte_m(self) -> float | None:
         """Mean |CTE| per tick [m]."""
         return self.total_m / self.ticks if self.total_m is not None and self.ticks else None

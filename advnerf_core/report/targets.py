@@ -48,7 +48,6 @@ _MEASURES: Mapping[str, _Measure] = {
     "excess_m": _Measure("excess per tick", 3, " m", lambda row: row.excess.excess_m if row.excess else None),
     "ratio": _Measure("total CTE", 2, " × plain object", lambda row: row.ratio),
     "mean_abs_cte_m": _Measure("mean |CTE|", 3, " m", lambda row: row.mean_abs_cte_m),
-    "spread": _Measure("std / mean", 2, "", lambda row: row.spread),
     "off_track": _Measure("drives off the track", 0, " drives", lambda row: float(row.off_track)),
     "off_track_share": _Measure(
         "share of drives off the track", 2, " of the drives", lambda row: row.off_track / row.drives
@@ -118,8 +117,7 @@ def _target(
         # A car that ran into something went no farther off.
         if row.excess is not None and row.excess.collided:
             text += f", collided: {collisions(row.excess.collided)}"
-    said = limit.said or _limit_text(limit, bound)
-    return Target(_what(limit), said, value, text, met, verdict, limit.paper)
+    return Target(_what(limit), _limit_text(limit, bound), value, text, met, verdict, limit.paper)
 
 
 def _what(limit: Limit) -> str:

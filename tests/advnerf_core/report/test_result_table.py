@@ -3,7 +3,6 @@ import csv
 import io
 import json
 from dataclasses import asdict
-from pathlib import Path
 
 import pytest
 import yaml
@@ -25,15 +24,19 @@ from advnerf_core.report.result_page import (
 from advnerf_core.report.result_table import make_table
 from advnerf_core.report.targets import Target, evaluate
 
-ROOT = Path(__file__).parents[3]
-PAPER = Reference.model_validate(yaml.safe_load((ROOT / "launch" / "paper.reference.yaml").read_text()))
+LIMITS = """
+- {scenario: straight, method: gradient, domain: surrogate, at_least: 2.5, paper: "2347 ± 49, 2.01 ×"}
+- {scenario: straight, method: gradient, at_least: 2}
+- {scenario: straight, method: random, at_most: 1.2, paper: "1193 ± 19, 1.02 ×"}
+- {scenario: green_screen, method: random, of: off_track, at_most: 0}
+- {scenario: monitor, method: gradient, of: off_track_share, at_least: 0.8}
+"""
 TICKS = 10
 FIRST = FirstScreen("What happened.")
 
 
 def targets_of(table):
-    """What the shipped experiments are held to."""
-    return evaluate(PAPER.targets, table)
+    return evaluate(Reference.model_validate({"targets": yaml.safe_load(LIMITS)}).targets, table)
 
 
 def wanted_of(cells):
@@ -179,16 +182,10 @@ def test_the_live_scenarios_have_targets_of_their_own():
     cells = [
         cell("monitor", "gradient", seed, ([9.0], [2.0], [True]), ([8.0], [2.0], [seed < 4]))
         for seed in range(5)
-    ] + [
-        cell("green_screen", "gradient", seed, ([9.0], [2.0], [True]), ([5.0 + 10 * seed], [1.0], [True]))
-        for seed in (0, 1)
     ]
     cells.append(cell("green_screen", "random", 0, ([2.0], [2.0], [False]), ([2.0], [2.0], [True])))
     found = {t.what: t for t in targets_of(make_table(wanted_of(cells), cells))}
     assert found["monitor, gradient, deployed: share of drives off the track"].met
-    spread = found["green_screen, gradient, deployed: std / mean"]
-    assert spread.value == pytest.approx(50**0.5 / 10.0)
-    assert spread.met is False
     assert found["green_screen, best random, deployed: drives off the track"].met is False
 
 

@@ -159,7 +159,6 @@ def test_a_file_is_named_by_its_path_or_by_its_name_here_before_what_is_shipped(
     monkeypatch.chdir(tmp_path)
     assert named_file("green_screen", "launch") == shipped("launch/green_screen.launch.yaml")
     assert named_file("room", "experiment") == shipped("launch/room.experiment.yaml")
-    assert named_file("paper", "experiment") == shipped("launch/paper.experiment.yaml")
     (tmp_path / "launch").mkdir()
     for name in ("green_screen", "mine"):
         (tmp_path / "launch" / f"{name}.launch.yaml").touch()
