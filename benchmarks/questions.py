@@ -164,7 +164,7 @@ QUESTIONS = (
         "What does the paper's table say on one build?",
         "The registered sets of the paper's own experiments, and what its assumptions about the lab are worth.",
         ("paper_table",),
-        picture="paper_car_above.webp",
+        picture="paper_junction_above.webp",
     ),
     Question(
         "correlation",
