@@ -20,7 +20,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.about import ObjectPlace, read_about
-from advnerf_core.report.evidence.page import above_of, film_of, searched_apart
+from advnerf_core.report.evidence.page import above_of, film_of, filmed_of, searched_apart
 from advnerf_core.report.evidence.registration import PrimaryTest
 from advnerf_core.report.evidence.results import Evidence, read_evidence
 from advnerf_core.report.evidence.verifying.layout import SET
@@ -78,7 +78,9 @@ def write_above_of(folder: Path) -> Path | None:
     shown = searched_apart(primary)
     if len(shown) > 1:
         return write_maps(evidence, shown, target)
-    return write_above(evidence, primary[-1], primary[0], about.object if about else None, film, target)
+    return write_above(
+        evidence, primary[-1], filmed_of(primary), about.object if about else None, film, target
+    )
 
 
 def write_maps(evidence: Evidence, shown: Sequence[Mapping[str, Any]], target: Path) -> Path:

@@ -125,13 +125,15 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
         *_drives_badly(data),
     ]
     if data["primary"]:
-        told = data["primary"][-1]
-        said = filter(None, [claim(told, data["rows"]), luck_sentences(told)])
+        apart = searched_apart(data["primary"])
+        told = apart if len(apart) > 1 else data["primary"][-1:]
+        said = [text for test in told for text in (claim(test, data["rows"]), luck_sentences(test)) if text]
         parts += [*(f"{each}\n" for each in said), _tests(data["primary"])]
     parts += [_table(registered), f"![Excess of every drive, by method and domain]({picture_of(name)})\n"]
     if data["filmed"]:
         parts.append(
-            f"![Drives past the plain object, the strongest baseline and the attack]({film_of(name)})\n"
+            f"![Drives past the plain object, the strongest baseline and the attack]({film_of(name)})\n\n"
+            f"*Film: {place_of(filmed_of(data['primary'])['test'])}.*\n"
         )
     if data.get("contrasts"):
         parts += ["### What each difference costs\n", _contrasts(data["contrasts"])]
@@ -153,12 +155,18 @@ def searched_apart(primary: Sequence[Mapping[str, Any]]) -> list[Mapping[str, An
     )
 
 
+def filmed_of(primary: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """The primary test from ``set.json`` whose drives are filmed: the first one; of scenarios with searches of their own the one with the largest difference."""
+    apart = searched_apart(primary)
+    return max(apart, key=lambda test: test["difference_m"] or 0.0) if len(apart) > 1 else primary[0]
+
+
 def _picture(name: str, data: Mapping[str, Any]) -> list[str]:
     if not data["primary"]:
         return []
     if len(searched_apart(data["primary"])) > 1:
         return [f"![All deployed drives of each scenario from above]({above_of(name)})\n"]
-    shown, filmed = (place_of(data["primary"][at]["test"]) for at in (-1, 0))
+    shown, filmed = (place_of(each["test"]) for each in (data["primary"][-1], filmed_of(data["primary"])))
     stills = f" Stills: {filmed}." if data["filmed"] else ""
     place = (data.get("about") or {}).get("object")
     stands = (

@@ -53,16 +53,17 @@ def test_every_set_shows_both_controls_and_the_sentence_uses_the_smaller_excess(
     assert "| over no object |" in text
     missing = [row["method"] for row in data["rows"] if row["over_no_object_m"] is None]
     assert text.count("| not driven |") == len([method for method in missing if method != "empty"])
-    test = data["primary"][-1]
-    (row,) = [
-        each
-        for each in data["rows"]
-        if each["domain"] == "deployed"
-        and all(each[key] == test["test"][key] for key in ("scenario", "victim", "method"))
-    ]
-    values = [row["excess_m"]] + [row["over_no_object_m"]] * (row["over_no_object_m"] is not None)
-    assert f"the car is {min(values):.3f} m per tick further" in text
-    assert all(f"{value:.3f}" in text for value in values)
+    apart = searched_apart(data["primary"])
+    for test in apart if len(apart) > 1 else data["primary"][-1:]:
+        (row,) = [
+            each
+            for each in data["rows"]
+            if each["domain"] == "deployed"
+            and all(each[key] == test["test"][key] for key in ("scenario", "victim", "method"))
+        ]
+        values = [row["excess_m"]] + [row["over_no_object_m"]] * (row["over_no_object_m"] is not None)
+        assert f"the car is {min(values):.3f} m per tick further" in text
+        assert all(f"{value:.3f}" in text for value in values)
 
 
 @pytest.mark.parametrize("name", SETS)
