@@ -41,7 +41,8 @@ def camera_try(
     ] = 15.0,
 ) -> None:
     """Read a source as the camera node does; print rate, missed frames, age of the stamps and brightness."""
-    from nodes.lab.camera_tools import parse_source, save_picture, try_source
+    from advnerf_core.data.image_files import write_image
+    from nodes.lab.camera_tools import parse_source, try_source
 
     trial = try_source(parse_source(source), frames, timeout_s)
     height, width = trial.picture.shape[:2]
@@ -51,7 +52,7 @@ def camera_try(
     if counted := ", ".join(f"{name} {value:g}" for name, value in trial.counters.items() if value):
         print(f"counters: {counted}")
     if output is not None:
-        save_picture(trial.picture, output)
+        write_image(output, trial.picture)
         print(f"saved {output}")
 
 
@@ -77,8 +78,9 @@ def camera_check(
 
     Exit code 1 if a part of it is not met.
     """
+    from advnerf_core.data.image_files import write_image
     from nodes.lab.camera_check import CameraBench, check_camera
-    from nodes.lab.camera_tools import parse_source, save_picture, source_document
+    from nodes.lab.camera_tools import parse_source, source_document
     from nodes.lab.plugin_tables import say_code
 
     met = True
@@ -89,7 +91,7 @@ def camera_check(
         print(f"{source.kind}:")
         met &= print_findings(check_camera(bench))
         if output is not None and bench.seen:
-            save_picture(bench.seen[-1].rgb, output)
+            write_image(output, bench.seen[-1].rgb)
             print(f"saved {output}")
     if not met:
         raise typer.Exit(_FAILURE_EXIT)

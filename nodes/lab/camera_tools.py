@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.data.image_files import write_image
 from advnerf_core.documents import Document, parse_yaml
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.strict import parse_value
@@ -107,18 +105,6 @@ def source_document(text: str, overrides: Sequence[str] = ()) -> Document:
 def parse_source(text: str, overrides: Sequence[str] = ()) -> Any:
     """The settings of a camera source; arguments as in `source_document`."""
     return parse_value(CameraSource, source_document(text, overrides))
-
-
-def save_picture(rgb: NDArray[np.uint8], file: Path) -> None:
-    """Write an image ``[H, W, 3]``.
-
-    Raises:
-        CameraToolError: The file name does not have the suffix of an image format.
-    """
-    try:
-        write_image(file, rgb)
-    except (cv2.error, ValueError):
-        raise CameraToolError(f"expected a file name that ends in .png or .jpg; got {file}") from None
 
 
 def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> SourceTrial:

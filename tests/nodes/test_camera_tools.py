@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from advnerf_core.data.errors import DatasetError
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.cameras.zed.calibration import Rectifier, load_factory_calibration
 from nodes.cli.camera import app
@@ -79,7 +80,7 @@ def test_wrong_source(text, message):
 
 
 def test_picture_format_that_nobody_knows(pictures, tmp_path):
-    with pytest.raises(CameraToolError, match=r"ends in .png or .jpg"):
+    with pytest.raises(DatasetError, match=r"name of a picture to write .* ends in '.xyz'"):
         run(
             "try",
             f"{{kind: folder, folder: {pictures}, rate_hz: 100}}",

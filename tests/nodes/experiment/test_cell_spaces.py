@@ -263,7 +263,7 @@ def test_a_defence_that_nothing_asks_for_is_told(
         (["space.kind=places", "space.samples=0"], "greater than or equal to 1"),
         (["space.kind=places", "space.move_m=.nan"], "finite number"),
         (["space=0"], "space"),
-        (["space.move_m=1"], "move_m"),
+        (["space.move_m=1"], "space.kind is missing; add it"),
     ],
 )
 def test_a_wrong_space_is_one_clear_error(
