@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ def write_film(experiment: Experiment, published: Path) -> Path | None:
     return target
 
 
-def _clips(experiment: Experiment, published: Path, test: dict[str, Any]) -> list[Path]:
+def _clips(experiment: Experiment, published: Path, test: Mapping[str, Any]) -> list[Path]:
     which, evidence = test["test"], read_evidence(published)
     searched = [
         evidence.searches((which["scenario"], which["placement"], which["victim"], method))[0]
