@@ -17,10 +17,14 @@ from pathlib import Path
 
 import pytest
 from _pytest.runner import runtestprotocol
+from hypothesis import HealthCheck, settings
 
 from tests.support.processors import Shortage
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # before any test imports MuJoCo
+# On a busy machine an example takes as long as it takes.
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 _ATTEMPTS, _REST_S = 5, 4.0
 _INSIDE = "ADVNERF_TEST_IN_ITS_OWN_PROCESS"
 

@@ -104,7 +104,7 @@ plain = (
 numberlike = st.text("0123456789+-.eExo_:infNaN", max_size=8)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(
     st.recursive(
         plain | numberlike,

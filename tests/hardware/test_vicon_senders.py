@@ -116,7 +116,7 @@ def test_a_restarted_tracker_is_a_fault_only_without_a_pause():
     assert not feed.fault
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32 - 1),
     loss=st.floats(0.0, 0.3),

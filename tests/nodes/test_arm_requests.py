@@ -197,7 +197,7 @@ ACTS = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(ACTS, max_size=25))
 def test_armed_only_by_a_young_request_that_nothing_came_after(acts):
     """Armed means: by a request first asked less than a second before, never decided before, after the last stop of any kind."""

@@ -247,7 +247,7 @@ def test_a_program_arms_only_the_twin(world, peer, allowed):
         assert world.arm(source="operator")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(
         st.sampled_from(["camera", "vicon", "policy", "compositor", "motor", "talk", "pause", "run"]),

@@ -54,7 +54,7 @@ def arrivals(rng, count, period_s, loss, hold_up_s):
             yield k, max(sent_s, free_s) + rng.exponential(2e-4)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),
     rate_hz=st.sampled_from([25.0, 50.0, 100.0, 250.0]),
@@ -73,7 +73,7 @@ def test_no_drive_is_impossible_whatever_the_network_does(seed, rate_hz, loss, h
         assert check.judge(round(last_s * 1e9), noisy(truth[k], rng)) == "", (k, last_s)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     size_m=st.floats(0.05, 2.4),
@@ -139,7 +139,7 @@ def test_a_clock_that_goes_back():
     assert check.judge(10_000_000, planar_pose(0.24, 0.0, 0.0)) == ""
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     stamps=st.lists(st.integers(-(10**10), 10**10), max_size=30),
     xs=st.lists(st.floats(), min_size=30, max_size=30),

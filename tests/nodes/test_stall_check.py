@@ -59,7 +59,7 @@ def test_a_jam_is_found_in_its_time(how, words, speed):
     assert words in problem
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(
     speed=st.one_of(st.floats(0.0, 1.3), st.floats(-0.87, 0.0)),
     dead_s=st.floats(0.0, 0.6),

@@ -85,7 +85,7 @@ def test_a_step_of_the_clock_of_the_hand_lets_go(monkeypatch, step_s):
     assert stack.run(500).armed, stack.reason
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.lists(
         st.tuples(

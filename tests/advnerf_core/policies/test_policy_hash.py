@@ -16,7 +16,7 @@ from advnerf_core.policies.load import load_any_policy, load_driver, policy_file
 from advnerf_core.policies.onnx_policy import OnnxNetwork
 from tests.support.onnx_models import mean_model, save_beside, steering
 
-QUICK = settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+QUICK = settings(max_examples=15, suppress_health_check=list(HealthCheck))
 GAINS = st.sampled_from([0.25, 0.5, -1.0, 2.0])
 
 

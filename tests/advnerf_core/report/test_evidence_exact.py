@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -58,7 +58,6 @@ def test_the_permutation_test_agrees_with_scipy(sizes):
 MEANS = st.lists(st.integers(-40, 40).map(lambda x: x / 8), min_size=6, max_size=7)
 
 
-@settings(deadline=None)
 @given(MEANS, MEANS, st.integers(-8, 8))
 def test_the_permutation_test_does_not_depend_on_origin_or_order(a, b, shift):
     found = permutation_test(a, b)

@@ -132,7 +132,7 @@ def test_the_e_stop_latches():
     assert bench.hold(bench.beat(), press=3) == ""
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(st.tuples(st.sampled_from("bhwrsxl"), st.integers(0, 400)), max_size=60))
 def test_nothing_holds_without_a_young_answer(steps):
     """Whatever the order of beats, late answers, waits, releases and stops: held means an answer to a beat of the last 0.25 s."""

@@ -60,7 +60,7 @@ def test_malformed_messages_are_one_clear_error(text):
         read_said(text)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     st.one_of(
         st.text(max_size=300),

@@ -113,7 +113,7 @@ def test_truncated_bytes_are_refused():
             decode("sensor_msgs/msg/Image", data[:length])
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     st.sampled_from(sorted({row.type for row in TOPICS.values()} | {topic("/status/x").type})),
     st.binary(max_size=200),
@@ -123,7 +123,7 @@ def test_arbitrary_bytes_are_decoded_or_refused_and_nothing_else(typename, noise
         decode(typename, b"\x00\x01\x00\x00" + noise)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.binary(max_size=60), max_size=5))
 def test_arbitrary_frames_are_refused(frames):
     with pytest.raises(MessageError):
