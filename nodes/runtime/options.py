@@ -28,12 +28,12 @@ def with_groups(command: Callable[..., None]) -> Callable[..., None]:
         else:
             parameters.append(parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY))
 
-    options = {parameter.name: _option_of(parameter) for parameter in parameters}
+    declared = {parameter.name: parameter for parameter in parameters}
 
     @functools.wraps(command)
     def run(**given: Any) -> None:
         for name, value in given.items():
-            _require_finite(options[name], value)
+            _require_finite(declared[name], value)
         for name, group in groups.items():
             given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
         command(**given)
@@ -65,9 +65,10 @@ def _option_of(parameter: inspect.Parameter) -> str:
     return next((name for name in names if isinstance(name, str) and name.startswith("--")), usual)
 
 
-def _require_finite(option: str, value: Any) -> None:
+def _require_finite(parameter: inspect.Parameter, value: Any) -> None:
     values = value if isinstance(value, tuple) else (value,)
     if any(isinstance(each, float) and not math.isfinite(each) for each in values):
+        option = _option_of(parameter)
         raise ConfigError(
             f"expected finite numbers for {option}, got {' '.join(map(str, values))}; correct {option}"
         )

@@ -160,12 +160,12 @@ def _values(records: list[_Record], name: str, images: str) -> NDArray[np.float6
     is_recorded = name != _STEERING or any(name in each.values for each in records)
     for each in records:
         value = each.values.get(name)
-        is_number = _is_number(value)
-        values.append(float(value) if _is_number(value) else math.nan)
-        if is_recorded and not is_number:
+        number = float(value) if _is_number(value) else None
+        values.append(math.nan if number is None else number)
+        if is_recorded and number is None:
             problems.append(f"{each.place}: {name}: expected a number, got {value!r:.40}; delete the record")
-        elif is_number and name == _STEERING and abs(values[-1]) > _WIDEST:
-            problems.append(f"{each.place}: {name}: expected -1 to 1, got {value:g}; delete the record")
+        elif number is not None and name == _STEERING and abs(number) > _WIDEST:
+            problems.append(f"{each.place}: {name}: expected -1 to 1, got {number:g}; delete the record")
         if not isinstance(each.values.get(images), str):
             problems.append(f"{each.place}: expected the image {images}, got none; delete the record")
     raise_problems(problems)
