@@ -21,6 +21,7 @@ __all__ = [
     "Dynamics",
     "FieldRenderer",
     "Line",
+    "Motion",
     "Path",
     "Pinhole",
     "PolicyContract",
@@ -64,7 +65,7 @@ if TYPE_CHECKING:
     from advnerf_core.attack.search.search import draw_start_states
     from advnerf_core.data.transforms import load_transforms
     from advnerf_core.data.views import PosedImages
-    from advnerf_core.driving.dynamics import Ackermann, Dubins, Dynamics
+    from advnerf_core.driving.dynamics import Ackermann, Dubins, Dynamics, Motion
     from advnerf_core.driving.path import Arc, Line, Path
     from advnerf_core.driving.rollout import Rollout, drive
     from advnerf_core.errors import AdvnerfError
@@ -93,7 +94,7 @@ else:
             "advnerf_core.attack.search.search": "draw_start_states",
             "advnerf_core.data.transforms": "load_transforms",
             "advnerf_core.data.views": "PosedImages",
-            "advnerf_core.driving.dynamics": "Ackermann Dubins Dynamics",
+            "advnerf_core.driving.dynamics": "Ackermann Dubins Dynamics Motion",
             "advnerf_core.driving.path": "Arc Line Path",
             "advnerf_core.driving.rollout": "Rollout drive",
             "advnerf_core.errors": "AdvnerfError",

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from advnerf_core.attack.objective import JudgedDrives
 from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.driving.dynamics import Motion
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.rollout import drive
 from advnerf_core.scene.fidelity import Effect, SceneAgreement
@@ -79,6 +80,7 @@ class TransferPrediction:
 
 def predict_transfer(
     problem: AttackProblem,
+    car: Motion,
     images: AttackableScene,
     clean: SceneAgreement,
     effect: Effect,
@@ -91,7 +93,8 @@ def predict_transfer(
     """Predict deployed drives with and without an attack.
 
     Args:
-        problem: Policy, dynamics, path, goals and limits; its start states are not used.
+        problem: Policy, path, goals and limits; the car that it is searched with, and its start states, are not used.
+        car: The deployed car.
         clean: Agreement of the steering on held-out views without attack, in the order of the path.
         effect: Effect of this attack on the same views.
         starts: Start states ``[S, n]`` of the deployed drives; the draws take turns.
@@ -117,7 +120,7 @@ def predict_transfer(
         share = effect.retained if attacked else 0.0
         noise = torch.from_numpy(residual - disagreement if attacked else -disagreement)
         policy = _AsDeployed(problem.policy, images, share, noise, attacked)
-        rollout = drive(policy, lambda states: states, problem.dynamics, starts, horizon.ticks, goals)
+        rollout = drive(policy, lambda states: states, car, starts, horizon.ticks, goals)
         limits = replace(horizon, held_cap_m=problem.held_cap_m)
         judged = JudgedDrives(rollout.states.double(), problem.path, limits, problem.fence_m)
         totals[attacked] = tuple(each.total_cte_m for each in judged.metrics)

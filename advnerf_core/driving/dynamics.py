@@ -17,12 +17,8 @@ from torch import Tensor
 STEERING_LIMITS_RAD = (-0.2634, 0.3135)
 
 
-class Dynamics(Protocol):
-    """Discrete dynamics ``x' = f(x, u)`` on states ``[B, n]`` whose first three entries are x [m], y [m], yaw [rad]."""
-
-    @property
-    def dt_s(self) -> float:
-        """Length of one control tick [s]."""
+class Motion(Protocol):
+    """A car that can be driven: ``x' = f(x, u)`` on states ``[B, n]`` whose first three entries are x [m], y [m], yaw [rad]."""
 
     @property
     def state_size(self) -> int:
@@ -30,6 +26,14 @@ class Dynamics(Protocol):
 
     def step(self, states: Tensor, controls: Tensor) -> Tensor:
         """States ``[B, n]`` one tick after ``states [B, n]`` under the controls ``[B]``, held over the tick."""
+
+
+class Dynamics(Motion, Protocol):
+    """A vehicle model that attacks are searched through: a motion with closed-form Jacobians."""
+
+    @property
+    def dt_s(self) -> float:
+        """Length of one control tick [s]."""
 
     def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives ``(df_dx [B, n, n], df_du [B, n])`` of :meth:`step`."""

@@ -69,10 +69,6 @@ class RespondingCar:
         poses = self._car.step(states[:, :_POSE], mean)
         return torch.cat([poses, acting[:, None], command[:, None]], dim=1)
 
-    def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
-        """Always an error: no search uses this car."""
-        raise NotImplementedError("a measured car predicts drives; search through the surrogate's car")
-
 
 def fit_response(poses: Sequence[Array], controls: Sequence[Array], ideal: Dubins | Ackermann) -> CarResponse:
     """Fit the response of a car to drives.

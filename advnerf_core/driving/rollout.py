@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advnerf_core.driving.dynamics import Dynamics
+from advnerf_core.driving.dynamics import Motion
 from advnerf_core.policies.network import Policy
 
 Observe = Callable[[Tensor], Tensor]
@@ -36,7 +36,7 @@ class Rollout:
 def drive(
     policy: Policy,
     observe: Observe,
-    dynamics: Dynamics,
+    dynamics: Motion,
     start_states: Tensor,
     steps: int,
     goals: Tensor | None = None,

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from advnerf_core.driving.dynamics import Dynamics
+from advnerf_core.driving.dynamics import Motion
 from advnerf_core.driving.path import Array
 from advnerf_core.geometry import VehicleState
 from advnerf_core.policies.network import images_to_tensor, tensor_to_images
@@ -175,7 +175,7 @@ class RenderedSource:
         self,
         name: str,
         prepare: Callable[[Array], Show],
-        dynamics: Dynamics,
+        dynamics: Motion,
         sample_texture: Callable[[np.random.Generator], Any] | None = None,
         batch_size: int = 8,
     ) -> None:

@@ -72,5 +72,6 @@ def loop(experiment, cell, folder, clean):
     def images(states, attacked):
         return (0.5 - 0.5 * states[:, 1] - states[:, 2] + TURN * attacked)[:, None, None, None]
 
-    problem = AttackProblem(Reads(), Nothing(), Dubins(1.0, 0.1), path, START, 20)
-    return problem, images, START, Horizon(20, 0.1, 0.4)
+    car = Dubins(1.0, 0.1)
+    problem = AttackProblem(Reads(), Nothing(), car, path, START, 20)
+    return problem, car, images, START, Horizon(20, 0.1, 0.4)

@@ -111,7 +111,7 @@ def predict_cell(
     without = clean.agreement if clean else agreement_on(policy, goal, fidelity.driven(experiment, cell, at))
     with_attack = agreement_on(policy, goal, fidelity.attacked(experiment, cell, folder, at))
     effect = Effect(with_attack.learned - without.learned, with_attack.real - without.real)
-    problem, images, starts, horizon = fidelity.loop(experiment, cell, folder, at)
+    problem, car, images, starts, horizon = fidelity.loop(experiment, cell, folder, at)
     none_m = clean.none_m if clean else None
-    found = predict_transfer(problem, images, without, effect, starts, horizon, draws, cell.seed, none_m)
+    found = predict_transfer(problem, car, images, without, effect, starts, horizon, draws, cell.seed, none_m)
     return found, GateDrive(without, found.none_m)

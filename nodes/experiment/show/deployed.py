@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from advnerf_core.driving.dynamics import Dynamics
+from advnerf_core.driving.dynamics import Motion
 from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
 from advnerf_core.driving.path import Path
 from advnerf_core.driving.rollout import Remembering, drive
@@ -169,12 +169,6 @@ class SelfDriving:
             self.blocked_tick = self._tick
         return states.new_tensor([[moved.x_m, moved.y_m, moved.yaw_rad]])
 
-    def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
-        """Always an error: a scene has no Jacobians."""
-        raise NotImplementedError(
-            "a deployment scene has no Jacobians: attacks are searched in the surrogate"
-        )
-
 
 class IdealDriving:
     """The surrogate's car in a scene that is only rendered: it follows its commands exactly, and only the fence stops it.
@@ -183,8 +177,8 @@ class IdealDriving:
         fence_m: Beyond this abs(x) or abs(y) the car counts as blocked [m]; None without a fence.
     """
 
-    def __init__(self, dynamics: Dynamics, fence_m: float | None) -> None:
-        self.state_size, self.dt_s = dynamics.state_size, dynamics.dt_s
+    def __init__(self, dynamics: Motion, fence_m: float | None) -> None:
+        self.state_size = dynamics.state_size
         self.blocked_tick: int | None = None
         self._dynamics, self._fence_m, self._tick = dynamics, fence_m, 0
 
@@ -200,10 +194,6 @@ class IdealDriving:
         if outside and self.blocked_tick is None:
             self.blocked_tick = self._tick
         return moved
-
-    def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
-        """Jacobians of the surrogate's car."""
-        return self._dynamics.jacobians(states, controls)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,6 @@ calibration predicts for the camera. No drive with the attack is used.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -122,24 +121,23 @@ def attacked(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> P
 
 def loop(
     experiment: Experiment, cell: Cell, folder: Path, clean: Path
-) -> tuple[AttackProblem, AttackableScene, torch.Tensor, Horizon]:
-    """Inputs of a prediction: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon.
+) -> tuple[AttackProblem, RespondingCar, AttackableScene, torch.Tensor, Horizon]:
+    """Inputs of a prediction: the problem, the car, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon.
 
     The car has the response of the deployed drives without attack in the folder ``clean``.
     """
     space, attack = _found(experiment, cell, folder)
     found, plain = space.restored(attack), space.plain
     with_it, without = (each.seen_by(space.surrogate) for each in (found, plain))
-    problem = Prepared.of(experiment, space, cell).problem
-    car, problem = _measured_car(experiment, clean), from_measured_starts(experiment, cell.scenario, problem)
-    problem = replace(problem, dynamics=car, start_states=car.start(problem.start_states))
+    problem = from_measured_starts(experiment, cell.scenario, Prepared.of(experiment, space, cell).problem)
+    car = _measured_car(experiment, clean)
 
     def images(states: torch.Tensor, attacked: bool) -> torch.Tensor:
         sensor, colours = (with_it, found.colours) if attacked else (without, plain.colours)
         return sensor.sense(states[:, :3], colours).images
 
-    starts = problem.start_states[: experiment.config.deploy.starts]
-    return problem, images, starts, experiment.limits
+    starts = experiment.measured_starts(cell.scenario)[: experiment.config.deploy.starts]
+    return problem, car, images, car.start(starts), experiment.limits
 
 
 def _measured_car(experiment: Experiment, clean: Path) -> RespondingCar:

@@ -14,6 +14,7 @@ from advnerf_core.scene.fidelity import Effect, SceneAgreement
 
 PATH = Path.from_segments((0.0, 0.0, 0.0), [Line(50.0)], closed=False)
 HORIZON = Horizon(20, 0.1, 0.4)
+CAR = Dubins(1.0, 0.1)
 START = torch.zeros(1, 3, dtype=torch.float64)
 TURN = 0.8  # what the attack adds to the turn rate [rad/s]
 
@@ -38,7 +39,7 @@ def images(states, attacked):
 
 
 def problem():
-    return AttackProblem(Reads(), Nothing(), Dubins(1.0, 0.1), PATH, START, 20)
+    return AttackProblem(Reads(), Nothing(), CAR, PATH, START, 20)
 
 
 def views(difference, effect_learned, effect_real):
@@ -49,14 +50,14 @@ def views(difference, effect_learned, effect_real):
 
 
 def driven(turn):
-    rollout = drive(Reads(), lambda s: images(s, False) + turn, Dubins(1.0, 0.1), START, HORIZON.ticks)
+    rollout = drive(Reads(), lambda s: images(s, False) + turn, CAR, START, HORIZON.ticks)
     return drive_metrics(PATH, rollout.states[:, 0].numpy(), HORIZON).total_cte_m
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.0])
 def test_without_disagreement_it_is_the_drive_with_that_share_of_the_effect(share):
     clean, effect = views(np.zeros(16), np.full(16, TURN), np.full(16, share * TURN))
-    found = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=9)
+    found = predict_transfer(problem(), CAR, images, clean, effect, START, HORIZON, draws=9)
     assert found.attacked_m == pytest.approx([driven(share * TURN)] * 9)
     assert found.retained == pytest.approx(share)
 
@@ -64,7 +65,7 @@ def test_without_disagreement_it_is_the_drive_with_that_share_of_the_effect(shar
 def test_a_constant_disagreement_moves_the_clean_drive_by_its_size():
     # Learned pictures say 0.2 more than real ones, so the deployed car steers 0.2 less.
     clean, effect = views(np.full(16, 0.2), np.full(16, TURN), np.full(16, TURN))
-    found = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=9)
+    found = predict_transfer(problem(), CAR, images, clean, effect, START, HORIZON, draws=9)
     assert found.none_m == pytest.approx([driven(-0.2)] * 9)
     assert found.attacked_m == pytest.approx([driven(TURN - 0.2)] * 9)
     excess_m = (driven(TURN - 0.2) - driven(-0.2)) / HORIZON.ticks
@@ -74,30 +75,30 @@ def test_a_constant_disagreement_moves_the_clean_drive_by_its_size():
 def test_draws_differ_by_what_was_measured_and_repeat_with_the_seed():
     noise = np.random.default_rng(0).normal(0.0, 0.3, 40)
     clean, effect = views(noise, np.full(40, TURN), np.full(40, TURN) + noise)
-    first = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=12, seed=3)
-    again = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=12, seed=3)
+    first = predict_transfer(problem(), CAR, images, clean, effect, START, HORIZON, draws=12, seed=3)
+    again = predict_transfer(problem(), CAR, images, clean, effect, START, HORIZON, draws=12, seed=3)
     assert first == again
     assert len(set(first.attacked_m)) == 12
     low, mean, high = first.excess_m_per_tick
     assert low < mean < high
     assert set(first.record()) >= {"excess_m", "excess_low_m", "excess_high_m", "retained", "draws"}
     other = Effect(effect.learned, 0.5 * effect.real)
-    alone = predict_transfer(problem(), images, clean, other, START, HORIZON, draws=12, seed=3)
+    alone = predict_transfer(problem(), CAR, images, clean, other, START, HORIZON, draws=12, seed=3)
     assert alone.none_m == first.none_m != alone.attacked_m  # the drive without attack knows nothing of it
     assert (
         predict_transfer(
-            problem(), images, clean, other, START, HORIZON, draws=12, seed=3, none_m=first.none_m
+            problem(), CAR, images, clean, other, START, HORIZON, draws=12, seed=3, none_m=first.none_m
         )
         == alone
     )
     with pytest.raises(ValueError, match="at least 9 draws"):
-        predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=8)
+        predict_transfer(problem(), CAR, images, clean, effect, START, HORIZON, draws=8)
 
 
 def test_the_fence_stops_a_car_as_the_protocol_does():
     clean, effect = views(np.zeros(16), np.full(16, TURN), np.full(16, TURN))
-    fenced = AttackProblem(Reads(), Nothing(), Dubins(1.0, 0.1), PATH, START, 20, fence_m=1.0, held_cap_m=0.1)
-    found = predict_transfer(fenced, images, clean, effect, START, HORIZON, draws=9)
+    fenced = AttackProblem(Reads(), Nothing(), CAR, PATH, START, 20, fence_m=1.0, held_cap_m=0.1)
+    found = predict_transfer(fenced, CAR, images, clean, effect, START, HORIZON, draws=9)
     assert found.attacked_m[0] < driven(TURN)
 
 

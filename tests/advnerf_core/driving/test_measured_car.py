@@ -78,5 +78,3 @@ def test_the_closed_form_of_a_tick_is_that_of_small_steps() -> None:
 def test_what_cannot_be_fitted_is_refused() -> None:
     with pytest.raises(ValueError, match="drive without attack first"):
         fit_response([np.zeros((2, 3))], [np.zeros(1)], CARS["dubins"])
-    with pytest.raises(NotImplementedError):
-        RespondingCar(CARS["dubins"], CarResponse(0.25)).jacobians(torch.zeros(1, 5), torch.zeros(1))
