@@ -201,6 +201,7 @@ class Stands(StrictModel):
         choose: The first such spot along the path, or the one at which it covers most of a drive's pictures: pixels times time.
         seen_s: Time for which a drive along the path sees nearly all of it, unhidden and from the front [s].
         least_px: Smallest height in the policy's picture during that time [px]. A solid object is taken for an upright square of its width.
+        within_half_lanes: Largest distance from the path. The far side of a junction is 12 and more away.
     """
 
     path: str | None = None
@@ -208,6 +209,7 @@ class Stands(StrictModel):
     choose: Literal["first", "largest_view"] = "first"
     seen_s: float = Field(default=2.0, gt=0.0)
     least_px: float = Field(default=8.0, gt=0.0)
+    within_half_lanes: float = Field(default=6.0, gt=1.0, le=20.0)
 
 
 class RuledObject(StrictModel):

@@ -22,8 +22,8 @@ from nodes.experiment.plan.placed import PlacedObject, RuledObject, in_a_lane
 from nodes.experiment.show.context import Experiment
 from nodes.runtime.errors import ConfigError
 
-# In half lanes: steps along the path and away from it, and the largest distance.
-_ALONG, _AWAY, _FARTHEST = 0.25, 0.25, 6.0
+# In half lanes: steps along the path and away from it.
+_ALONG, _AWAY = 0.25, 0.25
 # Share of a panel's points that must be visible, the tolerance of the scene's depth, and the steepest view [cos].
 _SEEN, _DEPTH_SHARE, _FACING = 0.9, 0.03, 0.3
 _TURN_RAD = 0.2  # a path that turns by less is straight
@@ -102,7 +102,7 @@ def _spots(experiment: Experiment, wanted: RuledObject, name: str) -> Iterator[P
     begin_m = float(path.project(drive[:1, :2]).s_m[0])
     length_m = float(np.hypot(*np.diff(drive[:, :2], axis=0).T).sum())
     sides = {"right": (-1.0,), "left": (1.0,), "either": (-1.0, 1.0), "outside": ()}[wanted.stands.side]
-    away_m = (half_lane_m * np.arange(1.0, _FARTHEST, _AWAY)).tolist()
+    away_m = (half_lane_m * np.arange(1.0, wanted.stands.within_half_lanes, _AWAY)).tolist()
     for passed_m in np.arange(ahead_m, length_m, _ALONG * half_lane_m).tolist():
         along_m = begin_m + passed_m
         if wanted.stands.side == "outside":

@@ -119,6 +119,20 @@ def test_outside_is_where_a_car_goes_that_misses_the_turn(lab: Lab, tmp_path: Pa
     assert np.remainder(yaws[1] - yaws[0], 2 * np.pi) > 0.2
 
 
+def test_a_spot_is_no_farther_from_the_path_than_the_rule_allows(lab: Lab, tmp_path: Path) -> None:
+    """Half a lane of the room is 0.4 m; the largest view is at two of them, and nearer spots are in the lane."""
+
+    def away_half_lanes(within: str) -> float:
+        experiment = room(tmp_path / within, f"{{choose: largest_view, within_half_lanes: {within}}}")
+        spot = placed(experiment, lab)
+        return abs(float(experiment.paths["track"].project(np.array([spot.x_m, spot.y_m])).cte_m)) / 0.4
+
+    assert away_half_lanes("6.0") == pytest.approx(2.0, abs=0.01)
+    assert 1.0 < away_half_lanes("1.9") < 1.9
+    with pytest.raises(ConfigError, match="expected a spot beside the path track where board fits"):
+        away_half_lanes("1.3")
+
+
 def test_a_solid_object_stands_by_the_rule_too(lab: Lab, tmp_path: Path) -> None:
     changes = [
         "carrier={kind: composed}",
