@@ -114,12 +114,14 @@ def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario
 def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[PrimaryTest]:
     """The tests on the main victim, per variant and path: the gradient against all baselines, and the coarse gradient against coarse ones.
 
-    Baselines are the methods whose textures neither trained nor judged the victim. A place without baselines has no test.
+    Baselines are the methods whose textures neither trained nor judged the victim. A place without baselines has no test, and neither has one
+    of a claim over places: that samples places, not the searches at one of them.
 
     Raises:
         SetError: A place with a baseline lacks others that a test needs.
     """
     tests = []
+    sampled = {name for each in experiment.config.claims for name in each.scenarios}
     for scenario in dict.fromkeys(cell.scenario for cell in cells):
         found = [each for each in cells if each.scenario == scenario]
         config = experiment.of(found[0]).config
@@ -136,6 +138,8 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
                 f"(textures of {', '.join(trained_on(config, victim))} train the victim, those of {', '.join(VALIDATED_ON)} judge it); add {'; '.join(lacking)} to "
                 "the methods"
             )
+        if scenario in sampled:
+            continue
         coarse = [name for name in against if name in COARSE_BASELINES] if COARSE_GRADIENT in methods else []
         tests += [
             PrimaryTest(scenario=scenario, victim=victim, method=method, against=tuple(names))

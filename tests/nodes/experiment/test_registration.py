@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from advnerf_core.report.evidence.families import coarse_cells_differ
-from advnerf_core.report.evidence.registration import FILE, SetError, read_registration
+from advnerf_core.report.evidence.registration import FILE, PlaceClaim, SetError, read_registration
 from nodes.experiment.engine.artefact import Settings, write_key
 from nodes.experiment.run.plan import plan_cells, registered_under
 from nodes.experiment.run.registering import primary_tests, register, registered_scenario
@@ -69,6 +69,18 @@ def test_a_test_needs_three_unseen_families_and_a_coarse_search(trained, tmp_pat
     with pytest.raises(SetError, match="baselines that a test of the gradient needs") as refused:
         primary_tests(made, made.cells)
     assert f"add {lacks} to the methods" in str(refused.value)
+
+
+def test_a_place_of_a_claim_over_places_has_no_test_of_its_own(trained, tmp_path):
+    places = ("right", "left", "elsewhere", "and_there")
+    over_places = PlaceClaim(
+        name="turns", scenarios=places, victims=("hardened", "naive"), against=(*FAMILIES, "cem")
+    )
+    made = made_of(trained, tmp_path, METHODS, claims=(over_places,))
+    assert {test.scenario for test in primary_tests(made, made.cells)} == {"straight"}
+    lacking = made_of(trained, tmp_path, ("random_coarse", "gradient"), claims=(over_places,))
+    with pytest.raises(SetError, match="right: expected the baselines that a test of the gradient needs"):
+        primary_tests(lacking, [cell for cell in lacking.cells if cell.scenario == "right"])
 
 
 def test_where_coarse_textures_have_other_cells_the_gradient_is_run_in_both(tmp_path):
