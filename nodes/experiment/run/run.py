@@ -20,6 +20,7 @@ from nodes.experiment.run.plan import elsewhere, plan_cells
 from nodes.experiment.run.store import NOT_DRIVEN, Store
 from nodes.experiment.run.worker import Ended, Job, Phase, run_here, run_in_process, wait_for_live
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.run import prepare_victims
 from nodes.experiment.steps.steering_gate import require_same_steering
 from nodes.lab.trials.tries import allow_more_tries
@@ -188,6 +189,8 @@ def _at_a_time(jobs: int, threads: int) -> str:
 def _prepare(experiment: Experiment, cells: Sequence[Cell], options: Options, say: Say) -> None:
     # All variants are read before anything is made, so that a mistake in the last does not cost the hours of the first.
     wanted = {cell.variant: experiment.of(cell) for cell in cells}
+    for each in wanted.values():
+        look_at_given(each)
     _refuse_two_in_one_folder(experiment, cells)
     for name, variant in {each.folder: (name, each) for name, each in reversed(wanted.items())}.values():
         say(f"{name or variant.config.name}: {variant.folder}")

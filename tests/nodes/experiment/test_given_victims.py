@@ -26,6 +26,7 @@ from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.plan import statuses
 from nodes.experiment.run.registering import register
+from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.deploy import DRIVES
@@ -222,6 +223,19 @@ def test_their_camera_is_compared_with_a_world_that_must_be_open_to_be_described
     assert (
         load_experiment(folder / "mine.experiment.yaml", "tiny", (change,), tmp_path / "run").view.width == 80
     )
+
+
+def test_variants_with_stages_of_their_own_are_run_from_nothing(folder: Path, tmp_path: Path) -> None:
+    """In a world that must be open to be described, which each variant has yet to photograph."""
+    changes = (
+        f"world={{kind: '{shut_world.NAME}', camera: {CAMERA}}}",
+        "over.method=[none]",
+        "victims={module: {policy: 'my_driver:factory'}}",
+        f"over.variant={{a: {{run_folder: {tmp_path / 'a'}}}, b: {{capture.seed: 1, run_folder: {tmp_path / 'b'}}}}}",
+    )
+    experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", changes, tmp_path / "run")
+    ended = run_cells(experiment, experiment.cells, Options(here=True), lambda text: None)
+    assert {each.name: each.how for each in ended} == {"a_module_none_0": "done", "b_module_none_0": "done"}
 
 
 def test_a_black_box_has_no_gradient(folder: Path) -> None:
