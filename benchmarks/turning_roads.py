@@ -1,9 +1,9 @@
 """Roads of MetaDrive whose turns a car can miss: ``python -m benchmarks.turning_roads``.
 
 On a gentle curve there is no turn to miss: a car that steers wrongly for a moment is still in its lane. The rule takes, before any
-attack, the first roads of each block sequence whose route has a sharp turn to the right, four seconds of way before it (room
-for five objects that are seen) and two behind it, and the stretch of that length. One side alone, as the victims are not told where to
-turn. It prints what an experiment file needs: ``world.road``.
+attack, the first roads of each block sequence whose route has a sharp turn to the right, two seconds of way before it and two behind
+it, and the stretch of that length. One side alone, as the victims are not told where to turn. It prints what an experiment file needs:
+``world.road``.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ SEQUENCES = ("SX", "ST", "CX", "CT", "SXS", "STS")
 SEEDS = range(1, 41)
 # A turn that can be missed: at most this radius, in half lanes, at least this angle, and so much way behind it [s].
 SHARPEST_HALF_LANES, LEAST_RAD, ONWARD_S = 12.0, math.radians(60.0), 2.0
-APPROACH_S = 4.0
-_LENGTH_M = 90  # at 6 m/s: 24 m before the turn, a right angle of the largest radius, 12 m behind it, and what the last block has left
+APPROACH_S = 2.0
+_LENGTH_M = 75  # at 6 m/s: 12 m before the turn, a right angle of the largest radius, 12 m behind it, and what the last block has left
 
 
 def missable_turn_m(path: ReferencePath, half_lane_m: float, onward_m: float) -> float | None:
