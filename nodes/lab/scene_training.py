@@ -129,7 +129,7 @@ def render(
     video: Path | None,
     report: Report,
 ) -> int:
-    """Render a field from every camera of a data set: colour, depth in millimetres (16 bit), and a video.
+    """Render a field from every camera of a data set: colour, depth (`depth_in_mm`), and a video.
 
     Images of a scene that was learned with alpha have alpha. The video shows it over white.
 
@@ -146,14 +146,18 @@ def render(
             _write_png(file, picture[..., ::-1])
         else:
             _write_png(file, _with_alpha(rgb[0].numpy(), alpha[0].numpy()))
-        depth_mm = np.nan_to_num(MM_PER_M * depth_m[0].numpy(), posinf=0.0)
-        depth_file = file.with_name(f"{file.stem}_depth_mm.png")
-        _write_png(depth_file, np.clip(depth_mm, 0, 65535).astype(np.uint16))
+        _write_png(file.with_name(f"{file.stem}_depth_mm.png"), depth_in_mm(depth_m[0].numpy()))
         frames.append(picture)
         report((index + 1) / len(loaded.rgb), file.stem)
     if video is not None:
         write_video(video, frames)
     return len(frames)
+
+
+def depth_in_mm(depth_m: Array) -> NDArray[np.uint16]:
+    """A depth image ``[H, W]`` in millimetres, as depth cameras write it: 0 where nothing is, or nothing that 16 bits can hold (65.5 m)."""
+    depth_mm = np.rint(MM_PER_M * depth_m)
+    return np.where(depth_mm <= np.iinfo(np.uint16).max, depth_mm, 0).astype(np.uint16)
 
 
 def rendered_files(listed: PosedImages, output: Path) -> list[Path]:

@@ -22,7 +22,7 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, train_scene
 from nodes.cli import main as cli
 from nodes.lab import scene_training
-from nodes.lab.scene_training import sample_intervals, scene_field
+from nodes.lab.scene_training import depth_in_mm, sample_intervals, scene_field
 from nodes.lab.training_request import TrainingRequest
 from nodes.runtime.errors import ConfigError
 
@@ -318,3 +318,8 @@ def test_options_of_intervals_reach_training_and_renderer(
 def test_impossible_intervals_are_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         request_for(tmp_path, **changes)
+
+
+def test_a_depth_that_a_file_cannot_hold_is_unknown_and_not_another_depth() -> None:
+    depth_m = np.array([[0.0, 1.2344, 65.535], [65.536, 90.0, np.inf]], np.float32)
+    assert depth_in_mm(depth_m).tolist() == [[0, 1234, 65535], [0, 0, 0]]
