@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -61,14 +60,10 @@ def log_export(
 
 
 def _print_facts(name: str, facts: LogFacts) -> None:
-    from advnerf_core.data.logs.drive_log import TIMES_GO_BACK
-
     log, (width, height) = facts.log, facts.size
     rows = table("", "")
-    rate = f"{log.rate_hz:.1f} Hz" if log.rate_hz else TIMES_GO_BACK
-    rate = "no times" if math.isnan(log.rate_hz) else rate
     rows.add_row("format", log.format)
-    rows.add_row("images", f"{log.count} of {width} x {height}, {rate}, {log.images}")
+    rows.add_row("images", f"{log.count} of {width} x {height}, {log.rate_in_words}, {log.images}")
     if len(log.cameras) > 1:
         rows.add_row("cameras", ", ".join(log.cameras))
     rows.add_row("steering", "none" if log.unit is None else str(log.unit))

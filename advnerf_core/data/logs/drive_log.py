@@ -15,7 +15,7 @@ from advnerf_core.data.image_files import Rgb
 from advnerf_core.data.logs.choice import LogChoice, LogError, Side
 
 Labels = Literal["expert", "recorded"]
-TIMES_GO_BACK = "times that go back or repeat"
+FASTEST_HZ = 1000.0  # no camera is faster; such times have another unit
 NOWHERE = (math.nan, math.nan, math.nan)
 # Of front wheels: at this angle and above, a value is in degrees, or in another unit.
 _STEEPEST_RAD = 1.0
@@ -144,6 +144,15 @@ class DriveLog:
     attached: Callable[[], Mapping[str, bytes]] = dict
     unchecked: str = ""
     joined_by: str = ""
+
+    @property
+    def rate_in_words(self) -> str:
+        """The rate with its unit, or what is wrong with the times."""
+        if math.isnan(self.rate_hz):
+            return "no times"
+        if not self.rate_hz:
+            return "times that go back or repeat"
+        return f"{self.rate_hz:.3g} Hz" + (": times in another unit" if self.rate_hz > FASTEST_HZ else "")
 
     def first_image(self) -> Rgb:
         """The first image.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.data.image_files import Rgb
 from advnerf_core.data.logs.choice import LogError
-from advnerf_core.data.logs.drive_log import TIMES_GO_BACK, DriveLog, LogFrame
+from advnerf_core.data.logs.drive_log import FASTEST_HZ, DriveLog, LogFrame
 from advnerf_core.data.logs.lerobot import (
     ATTACHED,
     DISTURBED,
@@ -38,7 +38,6 @@ _QUALITY = "5"  # x264's constant rate factor: errors of a level of 256, as roun
 _KEYFRAME_EVERY = "10"  # training reads frames in any order
 _LEAST_IMAGES = 4
 _STATISTICS_OF = 200
-_FASTEST_HZ = 1000  # faster are only times in another unit
 
 Report = Callable[[int], None]
 
@@ -97,12 +96,9 @@ def write_lerobot(
 
 
 def _rate_of(log: DriveLog) -> int:
-    if not 0.5 <= log.rate_hz <= _FASTEST_HZ:
-        found = (
-            "none" if math.isnan(log.rate_hz) else f"{log.rate_hz:.2g} Hz" if log.rate_hz else TIMES_GO_BACK
-        )
+    if not 0.5 <= log.rate_hz <= FASTEST_HZ:
         raise LogError(
-            f"expected times of the images of 0.5 to {_FASTEST_HZ} Hz in {log.path}, got {found}; give the images per second with --rate"
+            f"expected times of the images of 0.5 to {FASTEST_HZ:g} Hz in {log.path}, got {log.rate_in_words}; give the images per second with --rate"
         )
     return round(log.rate_hz)
 
