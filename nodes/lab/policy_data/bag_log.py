@@ -170,9 +170,14 @@ def _recorded_ns(message: BagMessage, decoded: Any) -> int:
     return message.log_ns
 
 
-def _refuse_going_back(latest_ns: int, stamp_ns: int, place: str) -> None:
-    """Two drives whose stamps overlap cannot be told apart: an image would be joined with the steering of the other one."""
-    if (back_s := (latest_ns - stamp_ns) / NS_PER_S) > _MOST_BACK_S:
+def _refuse_going_back(latest_ns: dict[str, int], topic: str, stamp_ns: int, place: str) -> None:
+    """Two drives whose stamps overlap cannot be told apart: an image would be joined with the steering of the other one.
+
+    Args:
+        latest_ns: The latest stamp of each topic so far; updated.
+    """
+    latest_ns[topic] = max(stamp_ns, latest_ns.get(topic, stamp_ns))
+    if (back_s := (latest_ns[topic] - stamp_ns) / NS_PER_S) > _MOST_BACK_S:
         raise LogError(
             f"{place}: expected stamps that go forward, got one {back_s:.3g} s before an earlier one; "
             "cut the bag there, or record again with one clock"
@@ -180,12 +185,11 @@ def _refuse_going_back(latest_ns: int, stamp_ns: int, place: str) -> None:
 
 
 def _frames(bag: Path, images: str, track: _Track, time_ns: _Time) -> Iterator[LogFrame]:
-    latest_ns: int | None = None
+    latest_ns: dict[str, int] = {}
     for number, message in enumerate(read_messages(bag, [images], types={images: IMAGE_TYPE})):
         image = decode(IMAGE_TYPE, message.cdr)
         stamp_ns, place = time_ns(message, image), f"{bag}, image {number}"
-        latest_ns = stamp_ns if latest_ns is None else max(latest_ns, stamp_ns)
-        _refuse_going_back(latest_ns, stamp_ns, place)
+        _refuse_going_back(latest_ns, images, stamp_ns, place)
         steering_rad, speed_mps = track.command(stamp_ns)
         yield LogFrame(
             rgb_image(image, f"{images} in {bag}"),
@@ -203,10 +207,13 @@ def _read_track(bag: Path, steering: str | None, topics: list[str], time_ns: _Ti
     track = _Track()
     wanted = [*topics, *([steering] if steering else [])]
     types = {steering: _ACKERMANN} if steering and steering != _SENT else {}
+    latest_ns: dict[str, int] = {}
     for message in read_messages(bag, wanted, types=types) if wanted else ():
         kind = types.get(message.topic) or topic_row(message.topic).type
         decoded = decode(kind, message.cdr)
-        _add(track, message.topic, kind, decoded, time_ns(message, decoded))
+        stamp_ns = time_ns(message, decoded)
+        _refuse_going_back(latest_ns, message.topic, stamp_ns, f"{bag}, {message.topic}")
+        _add(track, message.topic, kind, decoded, stamp_ns)
     for stream in (track.armed, track.sent, track.disturbed):
         stream.sort()
     return track

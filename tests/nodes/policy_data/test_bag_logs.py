@@ -104,14 +104,16 @@ def test_an_export_has_an_episode_for_each_drive_and_never_replaces_one(tmp_path
     assert sorted(each.name for each in tmp_path.iterdir()) == ["bag", "set", "two"]
 
 
-def write_ackermann(path, form, topics=("/drive",), unstamped=(), late_ns=1000, step=0.02, count=6, back_s=0):
+def write_ackermann(
+    path, form, topics=("/drive",), unstamped=(), late_ns=1000, step=0.02, count=6, going_back=()
+):
     """A bag of other software: images, and commands of a car.
 
     Args:
         unstamped: Topics whose stamps are all zero.
         late_ns: From an image to the recording of its command, and, in another clock, to its stamp [ns].
         step: Steering of an image above that of the one before.
-        back_s: How far the clock of all stamps jumps back before the fourth image [s].
+        going_back: Topics whose clock jumps 2 s back before the fourth image.
     """
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
@@ -134,12 +136,12 @@ def write_ackermann(path, form, topics=("/drive",), unstamped=(), late_ns=1000, 
             t = image.header.stamp.sec * 10**9 + image.header.stamp.nanosec
             if "/front/image" in unstamped:
                 image.header.stamp.sec = image.header.stamp.nanosec = 0
-            image.header.stamp.sec -= back_s if k >= 3 else 0
+            image.header.stamp.sec -= 2 if k >= 3 and "/front/image" in going_back else 0
             writer.write(images, t, pack(image, IMAGE))
             for topic, drive in zip(topics, drives, strict=True):
                 command = store.types[DRIVE](step * k, 0.0, 1.5, 0.0, 0.0)
                 message = store.types[ACKERMANN](header=make.header(k, "car"), drive=command)
-                message.header.stamp.sec += late_ns // 10**9 - (back_s if k >= 3 else 0)
+                message.header.stamp.sec += late_ns // 10**9 - (2 if k >= 3 and topic in going_back else 0)
                 if topic in unstamped:
                     message.header.stamp.sec = message.header.stamp.nanosec = 0
                 writer.write(drive, t + late_ns, pack(message, ACKERMANN))
@@ -169,10 +171,14 @@ def test_what_has_no_stamps_is_joined_by_the_times_of_recording(tmp_path, unstam
     assert log.labels == "recorded"  # without poses there is no expert
 
 
-def test_two_drives_whose_stamps_overlap_are_not_joined_with_each_other(tmp_path):
-    log = open_log(write_ackermann(tmp_path / "drive", "ros2", back_s=2))
+@pytest.mark.parametrize(
+    ("going_back", "place"),
+    [(("/front/image", "/drive"), "/drive"), (("/front/image",), "image 3"), (("/drive",), "/drive")],
+)
+def test_two_drives_whose_stamps_overlap_are_not_joined_with_each_other(tmp_path, going_back, place):
+    log = open_log(write_ackermann(tmp_path / "drive", "ros2", going_back=going_back))
     with pytest.raises(
-        LogError, match=r"drive, image 3: expected stamps that go forward, got one 1\.9 s before"
+        LogError, match=rf"drive, {place}: expected stamps that go forward, got one 1\.9 s before"
     ):
         list(log.frames())
 
