@@ -50,6 +50,10 @@ def read_tub(path: Path, choice: LogChoice) -> DriveLog:
     version = 2 if (path / MANIFEST).is_file() else 1
     found, left_out = _version_2(path) if version == 2 else _version_1(path)
     records, files = found
+    if not records and left_out:
+        raise LogError(
+            f"expected records in {path} that are not deleted, got {sum(left_out.values())} deleted ones; restore some in Donkeycar"
+        )
     cameras = tuple(
         sorted({key for each in records for key in each.values if key.startswith("cam/")}, key=_camera_order)
     )
@@ -114,11 +118,18 @@ def _version_2(path: Path) -> tuple[tuple[list[_Record], tuple[Path, ...]], dict
     catalogs = [path / name for name in names]
     counts: Counter[str] = Counter()
     records = []
+    first: dict[int, str] = {}
     for place, values in (row for catalog in catalogs for row in read_json_lines(catalog)):
         values = _object(place, values)
-        if values.get("_index") in deleted:
+        index = values.get("_index")
+        if index in deleted:
             counts[_DELETED] += 1
             continue
+        if isinstance(index, int) and (earlier := first.setdefault(index, place)) != place:
+            raise LogError(
+                f"{place}: _index: expected one that no record has, got {index}, which {earlier} has; images are named after it, so that this one's "
+                "was written over that one's: delete the earlier record"
+            )
         records.append(_Record(place, values, path / "images", _time_ms(values.get("_timestamp_ms"))))
     return (records, (manifest, *catalogs)), dict(counts)
 

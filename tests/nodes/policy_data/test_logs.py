@@ -174,6 +174,8 @@ DAMAGED = {
     "a record without an angle": ("tub 1", lambda f: (f / "record_4.json").write_text('{"cam/image_array": "4_cam-image_array_.jpg"}'), "user/angle: expected a number, got None"),
     "an angle that no float holds": ("tub 1", lambda f: edit(f / "record_4.json", {"user/angle": 10**400}), "user/angle: expected a number, got 1000"),
     "deleted records as text": ("tub 2", lambda f: edit(f / "manifest.json", {"deleted_indexes": ["4"]}), r"manifest\.json: deleted_indexes: expected the numbers of deleted records"),
+    "all records deleted": ("tub 2", lambda f: edit(f / "manifest.json", {"deleted_indexes": list(range(12))}), "that are not deleted, got 12 deleted ones"),
+    "an index twice": ("tub 2", lambda f: edit(f / "catalog_1.catalog", {"_index": 4}), r"catalog_1\.catalog:5: _index: expected one .* got 4, which .*catalog_0\.catalog:5 has"),
     "no list of deleted records": ("tub 2", lambda f: edit(f / "manifest.json", {"deleted_indexes": None}), "such as .4, 5., got None"),
     "excluded records in objects": ("tub 1", lambda f: (f / "exclude.json").write_text('[{"a": 1}]'), r"exclude\.json: expected the numbers of deleted records"),
     "a catalog named twice": ("tub 2", lambda f: edit(f / "manifest.json", {"paths": ["catalog_0.catalog"] * 2}), r"expected each catalog once, got catalog_0\.catalog again"),
