@@ -24,6 +24,10 @@ WORLD = "world.json"
 _SHARED = ("paths", "off_track_m", "car", "camera", "T_car_from_camera", "fence_m")
 
 
+class NotCapturedError(ConfigError):
+    """A world that must be open to be described was not captured yet."""
+
+
 @dataclass(frozen=True)
 class ExperimentWorld(RunFolder):
     """One resolved experiment, or one of its variants, with its worlds."""
@@ -78,14 +82,14 @@ class ExperimentWorld(RunFolder):
         """Paths, lanes, car and camera. The capture stage stores the description of a world that must be open for it.
 
         Raises:
-            ConfigError: The world must be open for it, and nothing is captured yet.
+            NotCapturedError: The world must be open for it, and nothing is captured yet.
         """
         try:
             return self._known_world.describe()
         except NotOpenError:
             kept = self._captured()
             if kept is None or kept["settings"] != self.seen_settings:
-                raise ConfigError(
+                raise NotCapturedError(
                     f"expected {self._kept_world} of this configuration, which the capture stage writes when the world {self.world_settings['kind']} is "
                     "open; run that stage first"
                 ) from None
@@ -96,7 +100,7 @@ class ExperimentWorld(RunFolder):
         """Whether the world's description is available: not before the capture stage if the world must be open for it."""
         try:
             _ = self.world
-        except ConfigError:
+        except NotCapturedError:
             return False
         return True
 

@@ -20,6 +20,7 @@ from nodes.experiment.plan.object_kinds import PANEL
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.experiment_world import NotCapturedError
 from nodes.experiment.show.given import VictimUnknownError, given_in, victim_spec
 from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_worlds
 from nodes.experiment.show.victims import look_at_given
@@ -63,7 +64,7 @@ def _load(experiment: Experiment, document: Document) -> Experiment:
         )  # package.module:factory may be beside the experiment file
     try:
         stages = stages_of(experiment)
-    except (VictimUnknownError, WorldUnknownError):
+    except (VictimUnknownError, WorldUnknownError, NotCapturedError):
         return experiment  # it was never run with its victims or its world
     return replace(experiment, kept=stage_digests(stages, experiment.folder, REFERENCE))
 
