@@ -51,14 +51,22 @@ def test_what_is_lacking_is_said_at_once():
     assert found[2].startswith("gradient_coarse")
 
 
-@pytest.mark.parametrize("name", ["gap_room", "gap_filament", "room"])
+@pytest.mark.parametrize("name", ["room", "paper_car", "paper_junction"])
 def test_sets_with_their_scene_and_victim_can_be_driven_again(name):
     assert is_kept(PUBLISHED / name)
     assert lost_note(PUBLISHED / name) == []
 
 
 @pytest.mark.parametrize(
-    "name", ["gap_duckietown", "gap_duckietown_robust", "gap_metadrive", "gap_metadrive_unseen"]
+    "name",
+    [
+        "gap_duckietown",
+        "gap_duckietown_robust",
+        "gap_filament",
+        "gap_metadrive",
+        "gap_metadrive_unseen",
+        "gap_room",
+    ],
 )
 def test_sets_whose_weights_are_lost_say_so(name):
     assert not is_kept(PUBLISHED / name)
