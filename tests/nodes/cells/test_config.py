@@ -202,9 +202,8 @@ def test_two_variants_in_one_run_folder_need_the_same_scene_and_policies(tmp_pat
     assert len(shipped) == 13
     for each in shipped:
         loaded = load(each)
-        if given_in(
-            loaded.config
-        ):  # what its victims see is compared with the camera of a world that must be open
+        if given_in(loaded.config):
+            # What its victims see is compared with the camera of a world that must be open.
             folders = {cell.variant: loaded.folder_of(cell) for cell in loaded.cells}
             assert len(set(folders.values())) == len(folders)
         else:

@@ -234,9 +234,8 @@ def test_variants_with_stages_of_their_own_are_run_from_nothing(folder: Path, tm
         f"over.variant={{a: {{run_folder: {tmp_path / 'a'}}}, b: {{capture.seed: 1, run_folder: {tmp_path / 'b'}}}}}",
     )
     experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", changes, tmp_path / "run")
-    register(
-        experiment, experiment.cells, tmp_path / "published"
-    )  # looks at the victims, and opens the world for it
+    # It looks at the victims, and opens the world for that.
+    register(experiment, experiment.cells, tmp_path / "published")
     again = load_experiment(folder / "mine.experiment.yaml", "tiny", changes, tmp_path / "run")
     ended = run_cells(again, again.cells, Options(here=True), lambda text: None)
     assert {each.name: each.how for each in ended} == {"a_module_none_0": "done", "b_module_none_0": "done"}

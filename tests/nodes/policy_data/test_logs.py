@@ -371,7 +371,9 @@ def test_what_is_wrong_with_the_times_of_a_log_is_said(tmp_path, monkeypatch, ca
     shown = " ".join(capsys.readouterr().out.split())  # lines are broken where the screen ends
     assert f"12 of 64 x 48, {said}, cam/image_array" in shown
     assert advnerf(monkeypatch, "log", "export", tub, "-o", str(tmp_path / "out")) == 2
-    assert f"got {said}; give the images per second" in capsys.readouterr().err
+    refused = capsys.readouterr().err
+    assert "expected times of the images of 0.5 to 1000 Hz in " in refused
+    assert f"got {said}; give the images per second" in refused
     assert not (tmp_path / "out").exists()
 
 
