@@ -30,6 +30,7 @@ class DuckietownConfig(StrictModel):
     Attributes:
         map_name: Name of a Duckietown map with a closed route.
         seed: Seed of everything that the map leaves open.
+        drives_from_m: Start of the drives along each closed route, in its direction [m].
         camera: Driving camera, mounted relative to the middle of the axle; the default is the robot's own.
         photo: Camera of the posed images that a surrogate is learned from.
         robot: The car.
@@ -39,6 +40,7 @@ class DuckietownConfig(StrictModel):
 
     map_name: str = Field(default="small_loop", min_length=1, pattern=r"^[\w-]+$")
     seed: int = Field(default=3, ge=0)
+    drives_from_m: float = Field(default=0.0, ge=0.0)
     camera: CameraConfig = CameraConfig(
         x_m=0.066, z_m=0.108, pitch_down_rad=math.radians(19.15), horizontal_fov_deg=107.8
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -34,7 +35,7 @@ class Duckietown(InstalledWorld):
 
     def __init__(self, config: DuckietownConfig | None = None) -> None:
         self.config = DuckietownConfig() if config is None else config
-        super().__init__("duckietown", self.config, RANGE_M, _LOWEST_M, frozenset({"robot"}))
+        super().__init__("duckietown", self.config, RANGE_M, _LOWEST_M, frozenset({"robot", "drives_from_m"}))
 
     def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
         """The closed routes of the map.
@@ -50,7 +51,7 @@ class Duckietown(InstalledWorld):
         robot, (width_m, depth_m) = self.config.robot, facts["size_m"]
         limit = robot.max_turn_rate_radps
         return WorldDescription(
-            paths=_named(lines),
+            paths={name: self._begun(path) for name, path in _named(lines).items()},
             off_track_m=_HALF_LANE_TILES * float(facts["tile_m"]),
             car=CarDescription("dubins", robot.speed_mps, (-limit, limit)),
             camera=self.camera_pinhole,
@@ -62,6 +63,11 @@ class Duckietown(InstalledWorld):
             ),
             facts={"simulator": str(facts["simulator"])},
         )
+
+    def _begun(self, path: ReferencePath) -> ReferencePath:
+        """The route, with the start of its drives as configured."""
+        begin_m = self.config.drives_from_m
+        return replace(path, drive_from=path.pose_at(begin_m)) if begin_m else path
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
         """Poses along, beside and above the routes; see `road_photo_poses`."""
