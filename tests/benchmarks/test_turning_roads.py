@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from benchmarks.turning_roads import missable_turn_m
+from benchmarks.turning_roads import approached_turns_m, missable_turn_m
 from hardware.worlds.paths import ReferencePath, Segment
 
 HALF_LANE_M = 1.75
@@ -33,3 +33,19 @@ def test_what_cannot_be_missed_is_none() -> None:
 def test_a_road_that_turns_left_first_is_not_taken() -> None:
     right: Segment = ("arc", 10.0, -RIGHT_ANGLE)
     assert turn_of(("line", 50.0), ("arc", 20.5, RIGHT_ANGLE), ("line", 50.0), right, ("line", 30.0)) is None
+
+
+def test_drives_of_a_closed_route_begin_before_the_turns_that_have_a_way_before_them() -> None:
+    """A square with one corner cut off: the turn after the short side has too little way before it, and the first one's is across the seam."""
+    corner: Segment = ("arc", 0.2, -RIGHT_ANGLE)
+    sides: list[Segment] = [("line", 1.0), ("line", 0.3), ("line", 2.0), ("line", 0.4)]
+    square = ReferencePath(
+        (0.0, 0.0, 0.0), tuple(piece for side in sides for piece in (corner, side)), closed=True
+    )
+    arc_m = 0.2 * RIGHT_ANGLE
+    # Ways before the four corners: 0.4, 1.0, 0.3 and 2.0.
+    assert approached_turns_m(square, 0.1, 0.4) == pytest.approx(
+        [square.length_m - 0.4, arc_m + 0.6, 3.0 * arc_m + 2.9]
+    )
+    assert approached_turns_m(square, 0.1, 1.5) == pytest.approx([3.0 * arc_m + 1.8])
+    assert approached_turns_m(square, 0.01, 0.4) == []  # gentle
