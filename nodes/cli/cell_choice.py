@@ -39,11 +39,11 @@ Folder = Annotated[
     ),
 ]
 Only = Annotated[
-    str,
+    list[str] | None,
     typer.Option(
         "--only",
         metavar="KEY=VALUE,...",
-        help="Only these cells, e.g. path=straight+left,method=gradient.",
+        help="Only these cells, e.g. path=straight+left,method=gradient. May be repeated.",
     ),
 ]
 
@@ -55,8 +55,13 @@ class CellChoice:
     file: File
     setting: Setting = None
     folder: Folder = None
-    only: Only = ""
+    parts: Only = None
     overrides: Overrides = None
+
+    @property
+    def only(self) -> str:
+        """The selection of cells as `select` reads it."""
+        return ",".join(self.parts or [])
 
 
 def load_cells(choice: CellChoice, executes: bool = True) -> tuple[Experiment, list[Cell]]:

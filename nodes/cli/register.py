@@ -15,7 +15,7 @@ def register(
     file: File,
     setting: Setting = None,
     folder: Folder = None,
-    only: Only = "",
+    only: Only = None,
     published: Annotated[
         Path,
         typer.Option(

@@ -117,6 +117,10 @@ def select(cells: Sequence[Cell], only: str) -> list[Cell]:
             raise ConfigError(
                 f"--only {only}: expected KEY=VALUE with KEY one of {', '.join(KEYS)}, got {part!r}"
             )
+        if key.strip() in wanted:
+            raise ConfigError(
+                f"--only {only}: expected {key.strip()} once, got it twice; join its values with +"
+            )
         wanted[key.strip()] = {each.strip() for each in value.split("+")}
     chosen = [
         cell for cell in cells if all(str(getattr(cell, key)) in values for key, values in wanted.items())

@@ -147,6 +147,8 @@ def test_cells_are_selected_by_what_they_are(file):
         select(cells, "mode=random")
     with pytest.raises(ConfigError, match="got none"):
         select(cells, "variant=monitor")
+    with pytest.raises(ConfigError, match=r"expected path once, got it twice; join its values with \+"):
+        select(cells, "path=left,path=right")
 
 
 @pytest.mark.parametrize(
