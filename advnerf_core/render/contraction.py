@@ -33,7 +33,7 @@ _NEVER = np.float32(1e30)
 _FAR = np.float32(FAR)
 
 
-def radial_stretch(shape: tuple[int, int, int]) -> Array32:
+def radial_stretch(shape: tuple[int, ...]) -> Array32:
     """Radial length of a grid's cells over the cube, relative to an inner cell: ``r^2``, at most the value at ``FAR``.
 
     Args:
@@ -131,51 +131,59 @@ def _way_out_across(y, d, r, dr, low, high):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL_OPTIONS)
-def next_sample_contracted(
-    ray: Array32, t: np.float32, end: np.float32, distance: Array8, cells: Array32
-) -> np.float32:
-    """``next_sample`` on a grid over the contracted cube.
+def leap_contracted(ray: Array32, t: np.float32, distance: Array8, cells: Array32) -> np.float32:
+    """The ray parameter [m] behind the empty block around ``t``; ``t`` itself in an occupied cell.
 
     Args:
         ray: Origin and direction ``[6]`` in box coordinates.
-        t: Ray parameter to start from [m].
-        end: End of the ray [m].
-        distance: ``[X, Y, Z]``.
+        t: Ray parameter [m].
+        distance: Leap distances over the contracted cube ``[X, Y, Z]``.
         cells: Cells per unit of the cube along each axis ``[3]``.
     """
     last_x, last_y, last_z = distance.shape[0] - 1, distance.shape[1] - 1, distance.shape[2] - 1
+    px, py, pz = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
+    gx, gy, gz = into_cube(px, py, pz)
+    i: Any = min(max(np.int32(gx * cells[0]), 0), last_x)
+    j: Any = min(max(np.int32(gy * cells[1]), 0), last_y)
+    k: Any = min(max(np.int32(gz * cells[2]), 0), last_z)
+    reach = np.int64(distance[i, j, k])
+    if reach == 0:
+        return t
     dx, dy, dz = _TWO * ray[3], _TWO * ray[4], _TWO * ray[5]
     wide_x, wide_y, wide_z = _f(4.0) / cells[0], _f(4.0) / cells[1], _f(4.0) / cells[2]
+    x, y, z = _TWO * px - _ONE, _TWO * py - _ONE, _TWO * pz - _ONE
+    low_x, high_x = _f(i - reach + 1) * wide_x - _TWO, _f(i + reach) * wide_x - _TWO
+    low_y, high_y = _f(j - reach + 1) * wide_y - _TWO, _f(j + reach) * wide_y - _TWO
+    low_z, high_z = _f(k - reach + 1) * wide_z - _TWO, _f(k + reach) * wide_z - _TWO
+    ax, ay, az = abs(x), abs(y), abs(z)
+    r = max(ax, ay, az)
+    if r <= _ONE:
+        step = min(_way_out_inside(x, dx, low_x, high_x), _way_out_inside(y, dy, low_y, high_y))
+        step = min(step, _way_out_inside(z, dz, low_z, high_z))
+    elif ax == r:
+        dr = np.copysign(dx, x * dx)
+        step = min(_way_out_along(x, dx, low_x, high_x), _way_out_across(y, dy, r, dr, low_y, high_y))
+        step = min(step, _way_out_across(z, dz, r, dr, low_z, high_z))
+    elif ay == r:
+        dr = np.copysign(dy, y * dy)
+        step = min(_way_out_along(y, dy, low_y, high_y), _way_out_across(z, dz, r, dr, low_z, high_z))
+        step = min(step, _way_out_across(x, dx, r, dr, low_x, high_x))
+    else:
+        dr = np.copysign(dz, z * dz)
+        step = min(_way_out_along(z, dz, low_z, high_z), _way_out_across(x, dx, r, dr, low_x, high_x))
+        step = min(step, _way_out_across(y, dy, r, dr, low_y, high_y))
+    # Into the next cell, so that rounding, which grows with distance, cannot trap a ray on a face.
+    return t + (step + _f(1e-4) + _f(2e-5) * t)
+
+
+@njit(**KERNEL_OPTIONS)
+def next_sample_contracted(
+    ray: Array32, t: np.float32, end: np.float32, distance: Array8, cells: Array32
+) -> np.float32:
+    """``next_sample`` on a grid over the contracted cube; arguments as in `leap_contracted`, and the ray's ``end`` [m]."""
     while t < end:
-        px, py, pz = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
-        gx, gy, gz = into_cube(px, py, pz)
-        i: Any = min(max(np.int32(gx * cells[0]), 0), last_x)
-        j: Any = min(max(np.int32(gy * cells[1]), 0), last_y)
-        k: Any = min(max(np.int32(gz * cells[2]), 0), last_z)
-        reach = np.int64(distance[i, j, k])
-        if reach == 0:
+        further = leap_contracted(ray, t, distance, cells)
+        if further == t:
             return t
-        x, y, z = _TWO * px - _ONE, _TWO * py - _ONE, _TWO * pz - _ONE
-        low_x, high_x = _f(i - reach + 1) * wide_x - _TWO, _f(i + reach) * wide_x - _TWO
-        low_y, high_y = _f(j - reach + 1) * wide_y - _TWO, _f(j + reach) * wide_y - _TWO
-        low_z, high_z = _f(k - reach + 1) * wide_z - _TWO, _f(k + reach) * wide_z - _TWO
-        ax, ay, az = abs(x), abs(y), abs(z)
-        r = max(ax, ay, az)
-        if r <= _ONE:
-            step = min(_way_out_inside(x, dx, low_x, high_x), _way_out_inside(y, dy, low_y, high_y))
-            step = min(step, _way_out_inside(z, dz, low_z, high_z))
-        elif ax == r:
-            dr = np.copysign(dx, x * dx)
-            step = min(_way_out_along(x, dx, low_x, high_x), _way_out_across(y, dy, r, dr, low_y, high_y))
-            step = min(step, _way_out_across(z, dz, r, dr, low_z, high_z))
-        elif ay == r:
-            dr = np.copysign(dy, y * dy)
-            step = min(_way_out_along(y, dy, low_y, high_y), _way_out_across(z, dz, r, dr, low_z, high_z))
-            step = min(step, _way_out_across(x, dx, r, dr, low_x, high_x))
-        else:
-            dr = np.copysign(dz, z * dz)
-            step = min(_way_out_along(z, dz, low_z, high_z), _way_out_across(x, dx, r, dr, low_x, high_x))
-            step = min(step, _way_out_across(y, dy, r, dr, low_y, high_y))
-        # Into the next cell, so that rounding, which grows with distance, cannot trap a ray on a face.
-        t += step + _f(1e-4) + _f(2e-5) * t
+        t = further
     return t

@@ -11,6 +11,7 @@ from scipy import ndimage
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
 from advnerf_core.parallel import run_slots, slot_bounds
+from advnerf_core.render.contraction import radial_stretch
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.render.occupancy import Leaps
 from advnerf_core.scene.baked import BakedScene, Voxels
@@ -21,7 +22,8 @@ from advnerf_core.scene.render_field import FieldRenderer
 
 # Length of a brick's part in pixels at the nearest view. Shorter ones look a little better and take much more memory.
 PART_PX = 1.4
-_MOST_HALVINGS = 3  # per side of a cell
+# Per side of a cell: down to the field's own finest cells. A contracted cube is twice as wide as its inner region, and so are its cells.
+_MOST_HALVINGS, _MOST_HALVINGS_CONTRACTED = 3, 4
 _SLOTS = 16
 _CHUNK = 1 << 20  # points baked at a time
 _CONSTANT = np.float32(0.28209479177387814)  # the spherical harmonic of degree 0
@@ -58,19 +60,13 @@ def bake(
     """Bake a field, including its colour map; see `bake_corners`.
 
     Raises:
-        NotBakedError: The field's colours depend on the direction, it reaches beyond its box, or it is transparent.
+        NotBakedError: The field's colours depend on the direction, or it is transparent.
     """
     config = source.config
-    if (
-        config.direction_bands > 1
-        or config.contraction
-        or not config.learned_background
-        or config.ray_unit_m != 1.0
-    ):
+    if config.direction_bands > 1 or not config.learned_background or config.ray_unit_m != 1.0:
         raise NotBakedError(
-            "expected a field in a box, opaque, with colours that do not depend on the direction, got one with contraction = "
-            f"{config.contraction}, learned_background = {config.learned_background}, direction_bands = {config.direction_bands}, "
-            f"a longest side of {config.extent_m:.4g} m"
+            "expected an opaque field with colours that do not depend on the direction, got one with learned_background = "
+            f"{config.learned_background}, direction_bands = {config.direction_bands}, a longest side of {config.extent_m:.4g} m"
         )
     return bake_corners(_OfField(source), T_world_from_camera, pinhole, part_px)
 
@@ -93,8 +89,7 @@ def bake_corners(
     coarse = Voxels(_corner_values(source), *none_yet, source.behind)
     plain = BakedScene(config, source.march, source.leaps, source.least_transmittance, coarse)
     poses = np.asarray(T_world_from_camera, np.float64).reshape(-1, 4, 4)
-    cell_m = config.extent_m / float(source.leaps.cells.max())
-    parts = cell_m * pinhole.fx / (part_px * plain.nearest_seen_m(poses, pinhole))
+    parts = _widths_m(source) * pinhole.fx / (part_px * plain.nearest_seen_m(poses, pinhole))
     voxels = _with_bricks(source, coarse, parts)
     return BakedScene(config, source.march, source.leaps, source.least_transmittance, voxels)
 
@@ -102,23 +97,46 @@ def bake_corners(
 def _corner_values(source: CornerValues) -> NDArray[np.uint8]:
     """Values at the corners of all cells; empty where no sample of an occupied cell can lie."""
     shape = np.array(source.leaps.distance.shape)
-    cell_m = source.config.extent_m / float(source.leaps.cells.max())
-    # A sample lies half an interval behind the point where its ray met an occupied cell.
-    reach = 1 + int(np.ceil(0.5 * source.march.largest_step_m / cell_m))
-    near = ndimage.maximum_filter(np.pad(source.leaps.distance == 0, (0, 1)), size=2 * reach + 1)
-    corners = np.flatnonzero(near)
-    values = np.zeros((near.size, 4), np.uint8)
+    corners = np.flatnonzero(_within_reach(source))
+    values = np.zeros((int(np.prod(shape + 1)), 4), np.uint8)
     for part in np.array_split(corners, max(1, len(corners) // _CHUNK)):
         points = np.stack(np.unravel_index(part, shape + 1), -1).astype(np.float32)
         values[part] = source.at(points / source.leaps.cells, _spacing(source))
     return values
 
 
+def _within_reach(source: CornerValues) -> NDArray[np.bool_]:
+    """Corners ``[X + 1, Y + 1, Z + 1]`` of cells in which a sample can lie: half an interval behind the point where its ray met an occupied cell."""
+    occupied = source.leaps.distance == 0
+    reach = 1 + int(np.ceil(0.5 * source.march.largest_step_m / _inner_cell_m(source)))
+    near: NDArray[np.bool_] = ndimage.maximum_filter(np.pad(occupied, (0, 1)), size=2 * reach + 1)
+    if source.config.contraction:
+        # Outside, an interval is as long as a cell is deep, and crosses many where it runs along their width.
+        outside = radial_stretch(source.leaps.distance.shape) > 1.0
+        near |= ndimage.maximum_filter(np.pad(outside, (0, 1)), size=2)
+    return near
+
+
+def _inner_cell_m(source: CornerValues) -> float:
+    """Length of a cell; if contracted, in the inner region, which is half of the cube."""
+    share = 2.0 if source.config.contraction else 1.0
+    return share * source.config.extent_m / float(source.leaps.cells.max())
+
+
+def _widths_m(source: CornerValues) -> float | NDArray[np.float32]:
+    """Width of the cells, ``[X, Y, Z]`` if contracted: outside it grows like the distance."""
+    cell_m = _inner_cell_m(source)
+    if not source.config.contraction:
+        return cell_m
+    return np.asarray(cell_m * np.sqrt(radial_stretch(source.leaps.distance.shape)), np.float32)
+
+
 def _with_bricks(source: CornerValues, coarse: Voxels, parts: NDArray[np.float32]) -> Voxels:
     """The voxels with bricks of at least ``parts [X, Y, Z]`` along the sides of cells, up to the limit."""
     logs = np.ceil(np.log2(np.maximum(parts.reshape(-1), 1.0))).astype(np.int64)
     cells = np.flatnonzero(logs > 0)
-    logs = np.minimum(logs[cells], _MOST_HALVINGS)
+    most = _MOST_HALVINGS_CONTRACTED if source.config.contraction else _MOST_HALVINGS
+    logs = np.minimum(logs[cells], most)
     counts = (2**logs + 1) ** 3
     begins = len(coarse.values) + np.cumsum(counts) - counts
     brick_of, log_sides = coarse.brick_of.copy(), coarse.log_sides.copy()

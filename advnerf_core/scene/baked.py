@@ -75,7 +75,7 @@ class BakedScene:
     ) -> None:
         self.config, self.march, self.leaps = config, march, leaps
         self.least_transmittance, self.voxels = least_transmittance, voxels
-        self._boxes = flat_boxes(leaps.distance)
+        self._boxes = leaps.distance if config.contraction else flat_boxes(leaps.distance)
 
     def render(
         self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole
@@ -140,6 +140,7 @@ class BakedScene:
                 depth_m,
                 alpha,
                 nearest_m,
+                self.config.contraction,
             )
 
         return Work(

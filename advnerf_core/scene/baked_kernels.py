@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from advnerf_core.fields.hash_grid_kernels import chunk_scratch, encode_level
 from advnerf_core.fields.mlp_kernels import TILE, dense
 from advnerf_core.parallel import KERNEL_OPTIONS
+from advnerf_core.render.contraction import growing_step, into_cube, leap_contracted, span_before_far
 from advnerf_core.render.march_kernels import span_in_box, step_size
 from advnerf_core.render.occupancy import FLAT, FLATNESS
 from advnerf_core.render.rays import write_ray
@@ -168,10 +169,25 @@ def _leap_all(grids, t, end, boxes, rays, count):  # type: ignore[no-untyped-def
 
 
 @njit(**KERNEL_OPTIONS)
+def _leap_all_contracted(rays, t, end, distance, cells, active, count):  # type: ignore[no-untyped-def]
+    """`_leap_all` in the contracted cube, for the rays ``active[:count]`` of ``rays [N, 6]``; ``active`` is used up."""
+    while count > 0:
+        going = 0
+        for a in range(count):
+            n = active[a]
+            s = t[n]
+            further = leap_contracted(rays[n], s, distance, cells) if s < end[n] else s
+            t[n] = further
+            active[going] = n
+            going += 1 if further > s else 0
+        count = going
+
+
+@njit(**KERNEL_OPTIONS)
 def render_baked(
     poses: Array32, intrinsics: Array32, first: int, stop: int, high: Array32, near: np.float32, steps: Array32, boxes: Array8,
     cells: Array32, brick_of: NDArray[np.int32], log_sides: Array8, words: NDArray[np.int32], behind: Array32, least_through: np.float32,
-    max_samples: int, rgb: Array32, depth_m: Array32, alpha: Array32, nearest_m: Array32,
+    max_samples: int, rgb: Array32, depth_m: Array32, alpha: Array32, nearest_m: Array32, contracted: bool,
 ) -> None:  # fmt: skip
     """Render pixel tiles ``first..stop`` of a batch of images.
 
@@ -186,7 +202,7 @@ def render_baked(
         high: High corner of the box ``[3]``.
         near: Nearest ray parameter [m].
         steps: Smallest and largest interval [m] and growth per metre ``[3]``.
-        boxes: Empty boxes ``[X, Y, Z]``, from ``flat_boxes``.
+        boxes: Empty boxes ``[X, Y, Z]``, from ``flat_boxes``; leap distances if contracted.
         cells: Cells per unit ``[3]``.
         brick_of: First value of the brick of each cell ``[X * Y * Z]``; negative without a brick, for which the corners of cells are used,
             which come first among the values.
@@ -199,14 +215,15 @@ def render_baked(
         depth_m: Planar depth ``[B, H, W]`` [m], written; infinite for empty pixels.
         alpha: ``[B, H, W]``, written.
         nearest_m: Per cell ``[X, Y, Z]``, the smallest distance from which it was seen, updated; empty to skip this.
+        contracted: Whether the field is contracted.
     """
     nx, ny, nz = boxes.shape
     height, width = alpha.shape[1], alpha.shape[2]
     across_image, down = (width + WIDE - 1) // WIDE, (height + HIGH - 1) // HIGH
     row_stride, plane_stride = nz + 1, (ny + 1) * (nz + 1)
     marked = nearest_m.shape[0] > 0
-    ray, grids, units = (
-        np.empty(6, np.float32),
+    rays, grids, units = (
+        np.empty((WIDE * HIGH, 6), np.float32),
         np.empty((WIDE * HIGH, 9), np.float32),
         np.empty(WIDE * HIGH, np.float32),
     )
@@ -233,8 +250,9 @@ def render_baked(
             row, column = top + n // WIDE, left + n % WIDE
             if row >= height or column >= width:
                 continue
+            ray = rays[n]
             scale[n] = write_ray(poses[image], intrinsics, _f(column) + _f(0.5), _f(row) + _f(0.5), ray)
-            t[n], end[n] = span_in_box(ray, high, near)
+            t[n], end[n] = span_before_far(ray, near) if contracted else span_in_box(ray, high, near)
             units[n] = np.sqrt(ray[3] * ray[3] + ray[4] * ray[4] + ray[5] * ray[5])
             for axis in range(3):
                 grids[n, axis], step = ray[axis] * cells[axis], ray[3 + axis] * cells[axis]
@@ -249,18 +267,25 @@ def render_baked(
             for _ in range(AHEAD if count * AHEAD <= WAVE else 1):
                 for a in range(count):
                     going[a] = active[a]
-                _leap_all(grids, t, end, boxes, going, count)
+                if contracted:
+                    _leap_all_contracted(rays, t, end, boxes, cells, going, count)
+                else:
+                    _leap_all(grids, t, end, boxes, going, count)
                 for a in range(count):
                     n = active[a]
                     if t[n] >= end[n] or taken[n] >= max_samples:
                         t[n] = end[n]
                         continue
-                    grid = grids[n]
-                    span = step_size(t[n], steps)
+                    grid, ray = grids[n], rays[n]
+                    span = growing_step(ray, t[n], steps) if contracted else step_size(t[n], steps)
                     s = t[n] + _f(0.5) * span
-                    x = min(max(grid[0] + s * grid[3], _ZERO), _f(nx) - _f(1e-3))
-                    y = min(max(grid[1] + s * grid[4], _ZERO), _f(ny) - _f(1e-3))
-                    z = min(max(grid[2] + s * grid[5], _ZERO), _f(nz) - _f(1e-3))
+                    x, y, z = grid[0] + s * grid[3], grid[1] + s * grid[4], grid[2] + s * grid[5]
+                    if contracted:
+                        x, y, z = into_cube(ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5])
+                        x, y, z = x * cells[0], y * cells[1], z * cells[2]
+                    x = min(max(x, _ZERO), _f(nx) - _f(1e-3))
+                    y = min(max(y, _ZERO), _f(ny) - _f(1e-3))
+                    z = min(max(z, _ZERO), _f(nz) - _f(1e-3))
                     i, j, k = np.int64(x), np.int64(y), np.int64(z)
                     owner[used], cell[used] = n, (i * ny + j) * nz + k
                     base[used] = i * plane_stride + j * row_stride + k

@@ -209,8 +209,8 @@ class DeviceSurrogate:
 
 def background_on(device: torch.device, background: BackgroundRenderer) -> BackgroundRenderer:
     """A renderer of backgrounds on a device; one that no device can render stays on the CPU."""
+    if isinstance(background, BakedScene | FieldRenderer) and background.config.contraction:
+        return background
     if isinstance(background, BakedScene):
         return TorchBaked(background, device)
-    if isinstance(background, FieldRenderer) and not background.config.contraction:
-        return TorchField(background, device)
-    return background
+    return TorchField(background, device) if isinstance(background, FieldRenderer) else background

@@ -83,6 +83,14 @@ class SceneConfig(StrictModel):
         description="Learn a gain per channel for each photograph; for worlds whose camera chooses its exposure.",
     )
     seed: int = 0
+    bake_unbounded: bool = Field(
+        default=False,
+        description="Bake the scene too if it extends outside its box, so that searches in it are faster.",
+    )
+
+
+# Whether an unbounded scene is baked. The scene itself does not depend on it.
+UNBOUNDED = {"bake_unbounded"}
 
 
 class ViewConfig(StrictModel):

@@ -33,9 +33,14 @@ _LEAST_ALIKE_DB, _COMPARED_VIEWS = 25.0, 16
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Write ``baked.safetensors``, unless the scene cannot be baked or loses quality, and ``baked.json``, which says which."""
+    field = load_field(experiment)
+    if field.config.contraction and not experiment.config.scene.bake_unbounded:
+        why = "expected a scene within its box, or scene.bake_unbounded, got one that extends outside it"
+        write_json(folder / COMPARED, {"used": False, "why": why})
+        return
     report(0.0, "baking")
     try:
-        baked = bake_scene(load_field(experiment), views_of(experiment), experiment.view.pinhole)
+        baked = bake_scene(field, views_of(experiment), experiment.view.pinhole)
     except NotBakedError as error:
         write_json(folder / COMPARED, {"used": False, "why": str(error)})
         return

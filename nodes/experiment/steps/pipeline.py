@@ -14,7 +14,7 @@ from nodes.experiment.engine.artefact import Settings
 from nodes.experiment.engine.stages import Stage
 from nodes.experiment.plan.carriers import ScreenConfig
 from nodes.experiment.plan.object_kinds import files_of, name_of
-from nodes.experiment.plan.sections import NETWORK
+from nodes.experiment.plan.sections import NETWORK, UNBOUNDED, SceneConfig
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
@@ -35,8 +35,8 @@ _OBJECTS: dict[str, Any] = {"objects": True, "object": {"panel_resolution", "pan
 _DRIVE: dict[str, Any] = {"paths": True, "horizon": True, "dt_s": True}
 READS: Mapping[str, dict[str, Any]] = {
     "capture": {"capture": True, "objects": True, **_CARRIER, **_DRIVE},
-    "scene": {"scene": True, "capture": {"colour_pairs"}},
-    "bake": {"measure": {"scene"}, **_DRIVE},
+    "scene": {"scene": set(SceneConfig.model_fields) - UNBOUNDED, "capture": {"colour_pairs"}},
+    "bake": {"measure": {"scene"}, "scene": UNBOUNDED, **_DRIVE},
     "object": {"object": {"car_resolution", "hydrant_resolution", "mesh_resolution", "fit_steps"}},
     "policy": {"policy": True, "attack": {"random_sigma"}, **_CARRIER, **_OBJECTS, **_DRIVE},
     "retrain": {
@@ -125,7 +125,7 @@ def _bake(experiment: Experiment) -> Stage:
 
 def _bake_own(experiment: Experiment, file: Path) -> Stage:
     inputs = {"view": experiment.view_settings, "scene": load_hash(file), "world": experiment.world_settings}
-    settings = Settings.of(experiment.config, READS["bake"], {"measure"}, **inputs)
+    settings = Settings.of(experiment.config, READS["bake"], {"measure": True, "scene": True}, **inputs)
     return _stage("bake", bake.run, experiment, settings)
 
 
@@ -144,6 +144,7 @@ def _learned_from(experiment: Experiment) -> dict[str, Any]:
         "view": experiment.view_settings,
         # Without the digest of the baked scene, as machines differ in its last bits.
         "bake": VERSIONS["bake"],
+        **experiment.config.scene.model_dump(include=UNBOUNDED, exclude_defaults=True),
         "architecture": experiment.config.policy.network.described(),
         # Its default differs between carriers, and it does not matter how the deployed drive shows objects.
         "training": experiment.config.carrier.training,

@@ -210,7 +210,8 @@ def test_fields_of_all_kinds_are_rendered_as_on_the_processor(device, side_m, ch
 def test_a_contracted_field_stays_on_the_processor(device):
     config = dataclasses.replace(FIELD, contraction=True)
     here = FieldRenderer(SceneField(config), np.ones((16, 16, 16), np.bool_), MarchConfig())
-    assert background_on(device, here) is here
+    baked = bake(here, np.zeros((0, 4, 4)), PINHOLE)
+    assert [background_on(device, each) for each in (here, baked)] == [here, baked]
 
 
 def check_background(device, here, poses):

@@ -238,9 +238,7 @@ def test_baked_values_are_those_of_the_field_at_the_corners(trained: TrainedScen
     )
 
 
-@pytest.mark.parametrize(
-    "change", [{"contraction": True}, {"direction_bands": 2}, {"learned_background": False}]
-)
+@pytest.mark.parametrize("change", [{"direction_bands": 2}, {"learned_background": False}])
 def test_what_cannot_be_baked_is_refused(change: dict[str, bool]) -> None:
     scene = SceneField(dataclasses.replace(FIELD, **change))
     field = FieldRenderer(scene, np.ones((8, 8, 4), np.bool_))

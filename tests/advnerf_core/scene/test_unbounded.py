@@ -16,6 +16,8 @@ from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig, Marcher, Samples
 from advnerf_core.render.occupancy import leap_distances
 from advnerf_core.render.rays import poses_in_box
+from advnerf_core.scene.bake import bake
+from advnerf_core.scene.baked import BakedScene
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, load_scene, save_scene, scene_hash
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
@@ -111,6 +113,32 @@ def test_the_renderer_agrees_with_plain_torch_in_colour_and_planar_depth() -> No
     assert np.median(error) < 1e-3
     assert depth_m.max() > 3.0, "some of what is seen lies outside the inner region"
     assert (alpha[0] - opacity.reshape(30, 40)).abs().median() < 1e-4
+
+
+def test_a_baked_scene_looks_like_its_contracted_field(tmp_path: Path) -> None:
+    """A smooth field that fills all space, so that what is seen lies on both sides of the inner region's border."""
+    smooth = HashGridConfig(levels=3, features=4, log2_entries=13, coarsest=6, finest=14)
+    config = dataclasses.replace(FIELD, grid=smooth, direction_bands=1)
+    scene = some_scene(4, config)
+    with torch.no_grad():
+        scene.density_2.bias[0] = -0.3
+        scene.colour_2.weight *= 3.0
+    field = FieldRenderer(scene, np.ones((32, 32, 32), np.bool_), WIDE)
+    poses = environment_poses(8, 3)
+    baked = bake(field, poses, CAMERA)
+    (rgb, depth_m, alpha), (field_rgb, field_depth_m, field_alpha) = (
+        each.render(poses, CAMERA) for each in (baked, field)
+    )
+    assert psnr(rgb.numpy(), field_rgb.numpy()) > 45.0
+    assert field_rgb.std() > 0.1
+    far = field_depth_m > 2.5
+    assert 0.1 < far.float().mean() < 0.9
+    for part in (far, ~far):
+        assert ((depth_m - field_depth_m).abs() / field_depth_m)[part].median() < 0.01
+    assert (alpha - field_alpha).abs().mean() < 0.01
+    baked.save(tmp_path / "baked.safetensors")
+    again = BakedScene.load(tmp_path / "baked.safetensors").render(poses, CAMERA)[0]
+    assert torch.equal(again, rgb)
 
 
 def environment(T: Array, radius_m: float = 8.0) -> NDArray[np.uint8]:

@@ -12,13 +12,16 @@ from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import make_transform, rotation_z
+from advnerf_core.scene.baked import BakedScene
+from advnerf_core.scene.render_field import FieldRenderer
 from hardware.worlds.lab.config import CameraConfig, LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.steps.keys import settings_hash
-from nodes.experiment.steps.run import load_experiment
+from nodes.experiment.steps.run import load_experiment, make_ready
 from tests.support.lab_photographs import photograph
 
 PHOTOGRAPHS, TICKS = 24, 3
@@ -95,6 +98,20 @@ def test_it_is_attacked_in_what_is_learned_and_held_out_views_are_not_learned_fr
     assert ">over no object [m]<" not in page, "no column of a control that nobody drove"
     assert "<h1>In the learned scene " in page
     assert "<video autoplay" in page, "the learned scene is filmed where nothing else is"
+
+
+def test_it_is_baked_if_asked_and_only_what_depends_on_that_is_made_again(folder: Path) -> None:
+    """It reaches outside its box, as the photographs do."""
+    plain, baked = loaded(folder), loaded(folder, "scene.bake_unbounded=true")
+    cell = Cell("track", "mine", "gradient", 0)
+    make_ready(plain, until="bake")
+    before = settings_hash(plain, cell)
+    assert isinstance(load_background(plain), FieldRenderer)
+    scene = (plain.stage_folder("scene") / "stage.json").read_bytes()
+    make_ready(baked, until="bake")
+    assert isinstance(load_background(baked), BakedScene)
+    assert (baked.stage_folder("scene") / "stage.json").read_bytes() == scene
+    assert settings_hash(baked, cell) != before
 
 
 def test_the_same_photographs_elsewhere_are_the_same_place(folder: Path, tmp_path: Path) -> None:
