@@ -60,7 +60,11 @@ class Experiment(ExperimentWorld):
         manifest = read_json(folder / "manifest.json")
         context = {"folder": FilePath(manifest["file"]).parent}
         search_folder_last(str(context["folder"]))  # may contain package.module:factory
-        config = ExperimentConfig.model_validate(manifest["config"], context=context)
+        stored = manifest["config"]
+        config = ExperimentConfig.model_validate(stored, context=context)
+        if given_in(config):  # these say what they see; a manifest has every section
+            stored = {name: section for name, section in stored.items() if name != "view"}
+            config = ExperimentConfig.model_validate(stored, context=context)
         return cls(config, FilePath(manifest["file"]), folder, manifest["setting"]).with_given_scene()
 
     def with_given_scene(self) -> Experiment:
