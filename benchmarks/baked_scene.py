@@ -2,7 +2,7 @@
 
 In the scene and against the victims of a run folder of the room (``make demo``), on the same views and starts through the field and through
 the baked scene. ``--pairs`` searches and deploys attacks both ways. ``--speed`` compares with the code before there were baked scenes;
-there the run folder may be the junction's.
+there the run folder may be the junction's. ``--frames`` compares frames alone, in a run folder of any experiment whose scene was baked.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from advnerf_core.objects.voxel.model import load_object, save_object
 from advnerf_core.scene.surrogate import BackgroundRenderer
 from advnerf_core.splats.scene_file import bake_scene
 from benchmarks.results import REPOSITORY, record_row
+from benchmarks.timing import seconds_in_turns
 from nodes.experiment.plan.victims import HARDENED, NAIVE
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.drives import deployed_drives
@@ -48,6 +49,7 @@ from nodes.experiment.steps.attack import attack_problem, search_settings
 
 COMMAND = "python -m benchmarks.baked_scene"
 _VIEWS, _EXCESS_M, _MOST_EVALUATIONS, _ITERATIONS, _SEEDS = 200, 0.15, 60, 50, 3
+_TURNS = 7
 Backgrounds = dict[str, BackgroundRenderer]
 
 
@@ -89,6 +91,24 @@ def fidelity(experiment: Experiment, backgrounds: Backgrounds) -> None:
         "baked scene: difference of steering", float(apart.mean()), "rad mean abs", "<= 0.002 rad", bool(apart.mean() <= 0.002),
         f"{_VIEWS} driving views within {experiment.world.off_track_m:g} m and 0.3 rad of the path; largest {float(apart.max()):.4f} rad",
     )  # fmt: skip
+
+
+def frames(experiment: Experiment, backgrounds: Backgrounds, run: Path) -> None:
+    """Time of a frame both ways, in turns, on views along the paths."""
+    poses, pinhole = bake_stage.views_of(experiment)[::40], experiment.view.pinhole
+    taken_s = seconds_in_turns(
+        {name: partial(each, poses, pinhole) for name, each in backgrounds.items()}, _TURNS
+    )
+    found = read_json(experiment.stage_folder("bake") / "baked.json")
+    bounds = "an unbounded" if experiment.world.box.contraction else "a bounded"
+    each_ms = {name: 1e3 * seconds / len(poses) for name, seconds in taken_s.items()}
+    note = (
+        f"{experiment.config.name}, {run.name}: {each_ms['baked']:.1f} ms against {each_ms['field']:.1f} ms, medians of {_TURNS} runs in turns; held-out views "
+        f"{found['psnr_baked_db']:.2f} dB against {found['psnr_field_db']:.2f} dB; {found['mib']:.0f} MiB of voxels"
+    )
+    ratio = taken_s["field"] / taken_s["baked"]
+    line = f"frame of {bounds} scene, baked"
+    record(line, ratio, "x as fast as through its field", "printed", None, note, "RUN --frames")
 
 
 @contextmanager
@@ -319,9 +339,13 @@ def main() -> None:
     parser.add_argument(
         "--pairs", action="store_true", help="search and deploy attacks both ways, instead (minutes)"
     )
+    parser.add_argument("--frames", action="store_true", help="compare frames alone, in any run folder")
     options = parser.parse_args()
     experiment = Experiment.resolved_in(options.run.resolve())
     backgrounds: Backgrounds = {"field": load_field(experiment), "baked": load_background(experiment)}
+    if options.frames:
+        frames(experiment, backgrounds, options.run)
+        return
     if options.pairs:
         pairs(experiment, backgrounds)
         return
