@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AwareDatetime, Field, model_validator
 
@@ -23,6 +23,7 @@ FORMAT: Literal["advnerf-audit-1"] = "advnerf-audit-1"
 Outcome = Literal["nothing_found", "found", "cannot_judge", "worse"]
 EXIT_CODES: dict[Outcome, int] = {"nothing_found": 0, "found": 1, "cannot_judge": 2, "worse": 3}
 Evidence = Literal["surrogate", "world", "live"]
+_EVIDENCE: tuple[Evidence, ...] = get_args(Evidence)  # from the weakest to the strongest
 PlaceKind = Literal["images", "video", "scene", "splat", "world"]
 Scale = Literal["world", "poses", "length", "positions", "fiducials"]
 Control = Literal["no_object", "plain_object"]
@@ -326,6 +327,11 @@ class AuditComparison(StrictModel):
     margin_m: NotNegative = Field(description="A lower end above this is worse [m].")
     starts: Annotated[int, Field(ge=2)]
 
+    @property
+    def is_worse(self) -> bool:
+        """Whether the policy leaves its path by more than before, beyond the margin."""
+        return self.effect.low_m > self.margin_m
+
 
 class AuditVerdict(StrictModel):
     """The conclusion of the audit."""
@@ -400,16 +406,24 @@ def _contradictions(result: AuditResult) -> list[str]:
     concluded = outcome != "cannot_judge"
     trusted = result.fidelity is not None and result.fidelity.trusted
     planted = result.planted is not None and result.planted.found
+    judged = [each.evidence for each in result.strongest.judgements] if result.strongest else []
     checks = (
         (
             result.place.scale is not None or result.strongest is None,
             "a judged object needs a known scale of the place",
         ),
         (
-            outcome != "found" or result.judgement is not None,
-            "found needs a judgement with the verdict's evidence",
+            outcome not in ("found", "nothing_found") or result.judgement is not None,
+            f"{outcome} needs a judgement with the verdict's evidence",
         ),
-        (outcome != "worse" or result.against is not None, "worse needs the comparison in against"),
+        (
+            result.judgement is None or evidence == max(judged, key=_EVIDENCE.index),
+            "a verdict needs the strongest evidence that was judged",
+        ),
+        (
+            (outcome == "worse") == (result.against is not None and result.against.is_worse),
+            "worse needs the comparison in against, with a lower end above the margin; such a comparison has no other verdict",
+        ),
         (
             not concluded or evidence != "surrogate" or trusted,
             "a verdict with surrogate evidence needs a trusted fidelity",

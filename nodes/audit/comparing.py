@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.files import sha256_of
+from advnerf_core.geometry import wrap_angle
 from advnerf_core.report.audit_result import AuditComparison, AuditedObject, AuditResult, Evidence, read_audit
 from nodes.audit.drives import FOUND, NO_OBJECT, PLAIN_OBJECT
 from nodes.audit.kept import read_drives
@@ -18,6 +21,8 @@ from nodes.runtime.errors import ConfigError
 ATTACK_KEPT = "object.attack.safetensors"
 # A change of the largest deviation up to this share of half a lane is no regression.
 MARGIN = 0.1
+# How accurately a world puts its car down.
+_SAME_START_M, _SAME_START_RAD = 0.05, 0.1
 _ARMS = (NO_OBJECT, PLAIN_OBJECT, FOUND)
 
 
@@ -63,12 +68,18 @@ class Before:
         }
 
     def compare(self, now: Mapping[str, ArmDrives], evidence: Evidence, limit_m: float) -> AuditComparison:
-        """The change of the arm that got worst, from drives of all arms from the earlier starts; the lane ends at a |CTE| of ``limit_m`` [m]."""
-        then = read_drives(self.folder).get(evidence)
-        if then is None:
+        """The change of the arm that got worst, from drives of all arms from the earlier starts; the lane ends at a |CTE| of ``limit_m`` [m].
+
+        Raises:
+            ConfigError: The earlier audit judged by other evidence, or from other starts, as of another place.
+        """
+        kept = read_drives(self.folder).get(evidence)
+        if kept is None:
             raise ConfigError(
                 f"--against {self.file}: expected drives of the same kind as now, {evidence}, got none; compare audits of one place"
             )
+        then = kept.arms
+        self._require_same_starts(now[NO_OBJECT], then[NO_OBJECT])
         changes = [change_of(now[name], then[name], len(_ARMS)) for name in _ARMS]
         return AuditComparison(
             file=str(self.file),
@@ -78,7 +89,17 @@ class Before:
             starts=self.result.starts.judging.count,
         )
 
-
-def is_worse(comparison: AuditComparison) -> bool:
-    """Whether the policy leaves its path by more than before, beyond the margin."""
-    return comparison.effect.low_m > comparison.margin_m
+    def _require_same_starts(self, now: ArmDrives, then: ArmDrives) -> None:
+        """Refuse drives that do not begin where the earlier ones did: of another place, path or lane, of which the seed draws others."""
+        starts, before = now.states[:, 0, :3], then.states[:, 0, :3]
+        if starts.shape == before.shape:
+            off_m = float(np.hypot(*(starts - before)[:, :2].T).max())
+            turned_rad = float(np.abs(wrap_angle(starts[:, 2] - before[:, 2])).max())
+            if off_m <= _SAME_START_M and turned_rad <= _SAME_START_RAD:
+                return
+            got = f"others, up to {off_m:.3f} m and {turned_rad:.3f} rad from them"
+        else:
+            got = f"{len(starts)} instead of {len(before)}"
+        raise ConfigError(
+            f"--against {self.file}: expected the starts of that audit, got {got}; compare audits of one place, path, car and --limit"
+        )

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,56 +86,27 @@ class Judged:
 
     def controls(self) -> list[AuditControl]:
         """The drives without an attack."""
-        return [
-            AuditControl(
-                kind=kind,
-                name=TITLES[kind],
-                evidence=self.evidence,
-                mean_off_path_m=float(drives.largest_m.mean()),
-                off_track=int(drives.left(self.limit_m).sum()),
-                starts=len(drives.largest_m),
-            )
-            for kind in get_args(ControlKind)
-            for drives in [self.drives[kind]]
-        ]
+        return controls_of(self.evidence, self.drives, self.limit_m)
 
     @property
     def shown_start(self) -> int:
         """The start for pictures and films: the one with the median effect."""
-        control = self.drives[self.judgement.control]
-        differences = self.drives[FOUND].largest_m - control.largest_m
-        return int(np.argsort(differences, kind="stable")[len(differences) // 2])
+        return _shown_start(self.drives[FOUND], self.drives[self.judgement.control])
 
     def as_result(self) -> AuditedDrives:
         """The same in the form of the audit's result."""
-        found, control = self.drives[FOUND], self.drives[self.judgement.control]
-        dt_s, limit_m, shown = self.experiment.config.dt_s, self.limit_m, self.shown_start
+        dt_s = self.experiment.config.dt_s
         return AuditedDrives(
             evidence=self.evidence,
             measure="max_abs_cte",
-            control=self.judgement.control,
-            effect=self.judgement.effect,
             disturbed=self._disturbed(),
-            starts=tuple(
-                JudgedStart(
-                    x_m=start[0],
-                    y_m=start[1],
-                    yaw_rad=start[2],
-                    off_path_m=float(found.largest_m[number]),
-                    control_off_path_m=float(control.largest_m[number]),
-                    off_track=bool(found.left(limit_m)[number]),
-                    control_off_track=bool(control.left(limit_m)[number]),
-                )
-                for number, start in enumerate(found.states[:, 0, :3].tolist())
-            ),
             path=_route(clean_poses(self.experiment, self.experiment.config.paths[0]), dt_s),
-            route=_route(found.states[shown], dt_s),
+            **numbers_of(self.drives, self.limit_m, dt_s),
         )
 
     def _disturbed(self) -> DisturbedDrives | None:
         if FOUND_DISTURBED not in self.drives:
             return None
-        found, plain = self.drives[FOUND_DISTURBED], self.drives[PLAIN_DISTURBED]
         effects = camera_effects(self.limit_m, self.experiment.config.measure.seed)
         return DisturbedDrives(
             noise=effects.noise,
@@ -143,10 +114,63 @@ class Judged:
             brightness=effects.brightness,
             jitter_m=effects.jitter_m,
             jitter_rad=effects.jitter_rad,
-            effect=effect_of(found, plain),
-            off_track=int(found.left(self.limit_m).sum()),
-            plain_off_track=int(plain.left(self.limit_m).sum()),
+            **disturbed_numbers_of(self.drives, self.limit_m),
         )
+
+
+def judgement_of(drives: Mapping[str, ArmDrives], limit_m: float) -> EffectJudgement:
+    """The judgement of the drives of all arms; the car has left its lane beyond a |CTE| of ``limit_m`` [m]."""
+    return judge(drives[FOUND], {name: drives[name] for name in CONTROLS}, limit_m)
+
+
+def numbers_of(drives: Mapping[str, ArmDrives], limit_m: float, dt_s: float) -> dict[str, Any]:
+    """The fields of `AuditedDrives` that follow from the drives of all arms: control, effect, starts and route."""
+    judgement = judgement_of(drives, limit_m)
+    found, control = drives[FOUND], drives[judgement.control]
+    starts = tuple(
+        JudgedStart(
+            x_m=start[0],
+            y_m=start[1],
+            yaw_rad=start[2],
+            off_path_m=float(found.largest_m[number]),
+            control_off_path_m=float(control.largest_m[number]),
+            off_track=bool(found.left(limit_m)[number]),
+            control_off_track=bool(control.left(limit_m)[number]),
+        )
+        for number, start in enumerate(found.states[:, 0, :3].tolist())
+    )
+    route = _route(found.states[_shown_start(found, control)], dt_s)
+    return {"control": judgement.control, "effect": judgement.effect, "starts": starts, "route": route}
+
+
+def disturbed_numbers_of(drives: Mapping[str, ArmDrives], limit_m: float) -> dict[str, Any]:
+    """The fields of `DisturbedDrives` that follow from the drives under a worse camera."""
+    found, plain = drives[FOUND_DISTURBED], drives[PLAIN_DISTURBED]
+    return {
+        "effect": effect_of(found, plain),
+        "off_track": int(found.left(limit_m).sum()),
+        "plain_off_track": int(plain.left(limit_m).sum()),
+    }
+
+
+def controls_of(evidence: Evidence, drives: Mapping[str, ArmDrives], limit_m: float) -> list[AuditControl]:
+    """The drives without an attack in the form of the audit's result."""
+    return [
+        AuditControl(
+            kind=kind,
+            name=TITLES[kind],
+            evidence=evidence,
+            mean_off_path_m=float(drives[kind].largest_m.mean()),
+            off_track=int(drives[kind].left(limit_m).sum()),
+            starts=len(drives[kind].largest_m),
+        )
+        for kind in get_args(ControlKind)
+    ]
+
+
+def _shown_start(found: ArmDrives, control: ArmDrives) -> int:
+    differences = found.largest_m - control.largest_m
+    return int(np.argsort(differences, kind="stable")[len(differences) // 2])
 
 
 def _route(poses: Array, dt_s: float) -> tuple[RoutePoint, ...]:
@@ -176,9 +200,7 @@ def judge_found(
         arms[PLAIN_DISTURBED] = replace(arms[PLAIN_OBJECT], disturbances=effects)
         arms[FOUND_DISTURBED] = replace(arms[FOUND], disturbances=effects)
     drives = drive_arms(with_them, arms, evidence, report)
-    controls = {name: drives[name] for name in CONTROLS}
-    judgement = judge(drives[FOUND], controls, limit_m)
-    return Judged(evidence, arms, drives, judgement, with_them, limit_m)
+    return Judged(evidence, arms, drives, judgement_of(drives, limit_m), with_them, limit_m)
 
 
 def drive_arms(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,23 @@ import numpy as np
 
 from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.path import Path as DrivenPath
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
-from advnerf_core.report.audit_result import AuditedDrives, AuditResult, Control, read_audit
+from advnerf_core.geometry import Array
+from advnerf_core.report.audit_result import AuditedDrives, AuditResult, Outcome, read_audit
 from hardware.worlds.paths import ReferencePath
-from nodes.audit.drives import FOUND, FOUND_DISTURBED, PLAIN_DISTURBED
-from nodes.audit.judging import CONTROLS, Judged
-from nodes.audit.verdict import ArmDrives, effect_of, judge
+from nodes.audit.drives import FOUND_DISTURBED
+from nodes.audit.judging import (
+    LEARNED_ARMS,
+    WORLD_ARMS,
+    Judged,
+    controls_of,
+    disturbed_numbers_of,
+    judgement_of,
+    numbers_of,
+)
+from nodes.audit.verdict import ArmDrives, EffectJudgement, effect_in_words
 from nodes.lab.worlds.expert_drive import as_path
 
 DRIVES, RESULT = "drives.json", "audit.json"
@@ -27,6 +38,10 @@ _SAME_M = 1e-6
 
 class AuditDiffersError(AdvnerfError):
     """An audit's numbers differ from those of its drives."""
+
+
+class KeptDrivesError(AdvnerfError, ValueError):
+    """The drives that an audit kept cannot be read."""
 
 
 def keep_drives(folder: Path, judged: Sequence[Judged]) -> None:
@@ -47,65 +62,112 @@ def _as_data(judged: Judged) -> dict[str, Any]:
     }
 
 
-def read_drives(folder: Path) -> dict[str, dict[str, ArmDrives]]:
-    """The judged drives by evidence and arm, measured again."""
-    return {evidence: _measured(data) for evidence, data in read_json(folder / DRIVES).items()}
+@dataclass(frozen=True, eq=False)
+class KeptDrives:
+    """Judged drives of one kind of evidence.
+
+    Attributes:
+        arms: The drives of each arm, by name.
+        horizon: Ticks of a drive, and the |CTE| beyond which the car has left its lane.
+    """
+
+    arms: Mapping[str, ArmDrives]
+    horizon: Horizon
 
 
-def _measured(data: Mapping[str, Any]) -> dict[str, ArmDrives]:
+def read_drives(folder: Path) -> dict[str, KeptDrives]:
+    """The judged drives by evidence, measured again.
+
+    Raises:
+        KeptDrivesError: The file does not hold drives as `keep_drives` writes them.
+    """
+    file = folder / DRIVES
+    kept = read_json(file)
+    try:
+        return {evidence: _measured(evidence, data) for evidence, data in kept.items()}
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise KeptDrivesError(
+            f"{file}: expected the drives of the audit beside it, of all arms and starts: {error!r}; restore both files, or audit again"
+        ) from None
+
+
+def _measured(evidence: str, data: Mapping[str, Any]) -> KeptDrives:
     path = as_path(ReferencePath.from_dict(data["path"]))
     horizon = Horizon(off_track_m=data["off_track_m"], **data["limits"])
-    found = {}
-    for name, listed in data["states"].items():
-        states, ticks = np.array(listed), np.array(data["driven_ticks"][name])
-        scores = [
-            drive_metrics(path, each[: 1 + driven], horizon)
-            for each, driven in zip(states, ticks, strict=True)
-        ]
-        found[name] = ArmDrives.of(states, scores, ticks)
-    return found
+    arms = {
+        name: _arm(path, horizon, np.array(data["states"][name], np.float64), data["driven_ticks"][name])
+        for name in (LEARNED_ARMS if evidence == "surrogate" else WORLD_ARMS)
+    }
+    shapes = {each.states.shape for each in arms.values()}
+    if len(shapes) != 1 or not all(shapes.copy().pop()):
+        raise ValueError(f"expected as many drives and states of each arm, got {sorted(shapes)}")
+    return KeptDrives(arms, horizon)
+
+
+def _arm(path: DrivenPath, horizon: Horizon, states: Array, driven_ticks: Sequence[int]) -> ArmDrives:
+    scores = [
+        drive_metrics(path, each[: 1 + driven], horizon)
+        for each, driven in zip(states, driven_ticks, strict=True)
+    ]
+    return ArmDrives.of(states, scores, driven_ticks)
 
 
 def check_audit(folder: Path) -> list[str]:
     """Recompute an audit's numbers from the drives in its folder; returns the checks, a line each.
 
     Raises:
-        AuditDiffersError: A number differs.
+        AuditDiffersError: A number differs, or drives of another audit are kept.
+        KeptDrivesError: The kept drives cannot be read.
     """
     result = read_audit(folder / RESULT)
-    if result.strongest is None:
+    judgements = () if result.strongest is None else result.strongest.judgements
+    drives = read_drives(folder) if judgements or (folder / DRIVES).exists() else {}
+    _same(folder, "judged evidence", [each.evidence for each in judgements], list(drives))
+    if not judgements:
         return [f"{folder}: {result.verdict.outcome}, nothing was judged"]
-    drives = read_drives(folder)
-    return [_check(folder, result, each, drives[each.evidence]) for each in result.strongest.judgements]
+    lines = [_check(folder, result, each, drives[each.evidence]) for each in judgements]
+    last = drives[judgements[-1].evidence]
+    _check_verdict(folder, result, judgement_of(last.arms, last.horizon.off_track_m))
+    return lines
 
 
-def _check(folder: Path, result: AuditResult, said: AuditedDrives, drives: Mapping[str, ArmDrives]) -> str:
-    limit_m = result.place.off_track_m
-    assert limit_m is not None, "an object is judged where the scale is known"
-    controls: dict[Control, ArmDrives] = {name: drives[name] for name in CONTROLS}
-    found = judge(drives[FOUND], controls, limit_m)
-    _same(folder, f"{said.evidence}: control", said.control, found.control)
-    for name in ("mean_m", "low_m", "high_m"):
-        _same(
-            folder, f"{said.evidence}: effect.{name}", getattr(said.effect, name), getattr(found.effect, name)
-        )
-    rows = zip(said.starts, drives[FOUND].largest_m, controls[found.control].largest_m, strict=True)
-    for number, (start, largest_m, control_m) in enumerate(rows):
-        where = f"{said.evidence}: start {number}"
-        _same(folder, f"{where}: off_path_m", start.off_path_m, float(largest_m))
-        _same(folder, f"{where}: control_off_path_m", start.control_off_path_m, float(control_m))
-        _same(folder, f"{where}: off_track", start.off_track, bool(largest_m > limit_m))
+def _check(folder: Path, result: AuditResult, said: AuditedDrives, kept: KeptDrives) -> str:
+    limit_m, drives = kept.horizon.off_track_m, kept.arms
+    _same(folder, "place.off_track_m", result.place.off_track_m, limit_m)
+    numbers: dict[str, Any] = numbers_of(drives, limit_m, kept.horizon.dt_s)
+    _same(folder, f"{said.evidence}: disturbed", said.disturbed is not None, FOUND_DISTURBED in drives)
     if said.disturbed is not None:
-        worse, plain = drives[FOUND_DISTURBED], drives[PLAIN_DISTURBED]
-        where = f"{said.evidence}: disturbed"
-        _same(folder, f"{where}.effect.mean_m", said.disturbed.effect.mean_m, effect_of(worse, plain).mean_m)
-        _same(folder, f"{where}.off_track", said.disturbed.off_track, int(worse.left(limit_m).sum()))
-    if said.evidence == result.verdict.evidence and result.verdict.outcome in ("found", "nothing_found"):
-        _same(folder, "verdict", result.verdict.outcome, "found" if found.found else "nothing_found")
+        numbers["disturbed"] = said.disturbed.model_copy(update=disturbed_numbers_of(drives, limit_m))
+    again = said.model_copy(update=numbers)
+    _same(folder, said.evidence, said.model_dump(), again.model_dump())
+    # Their names are for readers, and may be others by now.
+    controls = [each.model_dump(exclude={"name"}) for each in controls_of(said.evidence, drives, limit_m)]
+    there = [each.model_dump(exclude={"name"}) for each in result.controls if each.evidence == said.evidence]
+    _same(folder, f"{said.evidence}: controls", there, controls)
     return f"{folder}: {said.evidence}, {len(said.starts)} starts: as the drives say"
 
 
+def _check_verdict(folder: Path, result: AuditResult, judged: EffectJudgement) -> None:
+    """Whether the verdict is that of the last judged drives, which is the strongest evidence, and its sentence has their numbers."""
+    outcome = result.verdict.outcome
+    possible: tuple[Outcome, ...] = ("found",) if judged.found else ("nothing_found", "cannot_judge")
+    if outcome != "worse":
+        _same(folder, "verdict", outcome, outcome if outcome in possible else possible[0])
+    if outcome in ("found", "nothing_found"):
+        sentence, numbers = result.verdict.sentence, effect_in_words(judged)
+        _same(folder, "verdict.sentence", numbers if numbers in sentence else sentence, numbers)
+
+
 def _same(folder: Path, what: str, said: Any, computed: Any) -> None:
+    """Raise if two values differ, or two of the values that they are made of."""
+    if isinstance(said, dict) and isinstance(computed, dict) and said.keys() == computed.keys():
+        for key, value in said.items():
+            _same(folder, f"{what}.{key}", value, computed[key])
+        return
+    if isinstance(said, list | tuple) and isinstance(computed, list | tuple) and len(said) == len(computed):
+        for number, value in enumerate(said):
+            _same(folder, f"{what}.{number}", value, computed[number])
+        return
     alike = (
         abs(said - computed) <= _SAME_M
         if isinstance(said, float) and isinstance(computed, float)
@@ -113,5 +175,5 @@ def _same(folder: Path, what: str, said: Any, computed: Any) -> None:
     )
     if not alike:
         raise AuditDiffersError(
-            f"{folder / RESULT}: {what}: expected {computed} from the kept drives, got {said}"
+            f"{folder / RESULT}: {what}: expected {computed} from the kept drives, got {said}; restore the folder, or audit again"
         )

@@ -33,7 +33,7 @@ from advnerf_core.report.audit_result import (
     TriedSearch,
     write_audit,
 )
-from nodes.audit.comparing import ATTACK_KEPT, is_worse
+from nodes.audit.comparing import ATTACK_KEPT
 from nodes.audit.drives import PICTURE
 from nodes.audit.judging import Judged, film, texture_of
 from nodes.audit.kept import RESULT, keep_drives
@@ -42,6 +42,7 @@ from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, SELECTION_STARTS,
 from nodes.audit.schedule import NEVER_TRIED
 from nodes.audit.searching import FoundAttack, Searches
 from nodes.audit.spots import Spot
+from nodes.audit.verdict import effect_in_words
 from nodes.experiment.plan.object_kinds import footprint_m, name_of
 from nodes.experiment.show.context import Experiment
 from nodes.runtime.progress import Report
@@ -143,7 +144,7 @@ def write_result(known: Known, result: AuditResult, folder: Path, report: Report
 
 def verdict_of(known: Known) -> AuditVerdict:
     """The conclusion of the audit."""
-    if known.against is not None and is_worse(known.against):
+    if known.against is not None and known.against.is_worse:
         evidence = known.question.place.evidence
         return AuditVerdict(outcome="worse", evidence=evidence, sentence=_worse(known.against))
     if known.reasons:
@@ -164,23 +165,18 @@ def verdict_of(known: Known) -> AuditVerdict:
 
 def _sentence(known: Known, judged: Judged) -> str:
     judgement, place = judged.judgement, known.question.place
-    effect, left = judgement.effect, judgement.left["object"]
     where = (
         f"In {place.name}, by its own car" if judged.evidence == "world" else f"In {_copy(known)}, not driven"
     )
-    moves = f"{effect.mean_m:.2f} m farther off its path (95 % {effect.low_m:.2f} to {effect.high_m:.2f})"
-    out = f"out of its lane from {left} of {judgement.starts} starts"
+    moves = effect_in_words(judgement)
     if judgement.found:
         others = max(judgement.left["no_object"], judgement.left["plain_object"])
         plain = "a plain one does not" if others == 0 else f"a plain one, or none, does from {others}"
         by_picture = int(judged.drives[PICTURE].left(judged.limit_m).sum())
         picture = f", a photograph in its place does from {by_picture}" if by_picture else ""
-        return f"{where}, {_object(known)} brings the policy {moves} and {out}; {plain}{picture}."
+        return f"{where}, {_object(known)} brings the policy {moves}; {plain}{picture}."
     tried = len(known.searches.found) if known.searches else 0
-    return (
-        f"{where}, no object was found within this budget that drives the policy out of its lane: the strongest of {tried} brings it {moves} "
-        f"and {out}."
-    )
+    return f"{where}, no object was found within this budget that drives the policy out of its lane: the strongest of {tried} brings it {moves}."
 
 
 def _worse(against: AuditComparison) -> str:

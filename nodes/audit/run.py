@@ -14,7 +14,7 @@ from advnerf_core.data.image_files import write_image
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.report.audit_result import AuditComparison, AuditResult, Evidence, PlantedControl
 from nodes.audit.budget import Costs
-from nodes.audit.comparing import ATTACK_KEPT, Before, is_worse
+from nodes.audit.comparing import ATTACK_KEPT, Before
 from nodes.audit.drives import (
     FOUND,
     NO_OBJECT,
@@ -156,7 +156,7 @@ class Audit:
             raise CannotJudgeError("interrupted before the first search was finished")
         self._judge(known, copies, plan, searches.best)
         assert known.judged
-        if known.judged[-1].judgement.found or (known.against is not None and is_worse(known.against)):
+        if known.judged[-1].judgement.found or (known.against is not None and known.against.is_worse):
             return
         if known.interrupted and len(searches.found) < sum(map(len, searches.planned)):
             raise CannotJudgeError("interrupted before the end of the schedule, with nothing found so far")

@@ -34,6 +34,17 @@ def judged_drives(evidence="world", effects_m=(0.8, 0.9, 1.0, 0.3)):
     }
 
 
+def comparison(outcome):
+    """The comparison of a result with this outcome to an earlier one."""
+    return {
+        "file": "old.json",
+        "sha256": "0" * 64,
+        "effect": judged_drives()["effect"],
+        "margin_m": 0.05 if outcome == "worse" else 5.0,
+        "starts": 4,
+    }
+
+
 def audit(outcome="found", evidence="world", **changes):
     """A valid result of an audit as JSON values; ``changes`` replace whole sections."""
     reasons = (

@@ -9,21 +9,14 @@ from pydantic import ValidationError
 
 from advnerf_core.errors import ConfigError
 from advnerf_core.report.audit_result import AuditResult, audit_schema, read_audit, write_audit
-from tests.support.audits import audit, audit_result, judged_drives
+from tests.support.audits import audit, audit_result, comparison, judged_drives
 
-COMPARISON = {
-    "file": "old.json",
-    "sha256": "0" * 64,
-    "effect": judged_drives()["effect"],
-    "margin_m": 0.05,
-    "starts": 4,
-}
 OUTCOMES = {"nothing_found": 0, "found": 1, "cannot_judge": 2, "worse": 3}
 
 
 @pytest.mark.parametrize(("outcome", "code"), OUTCOMES.items())
 def test_a_result_is_read_as_it_was_written(tmp_path, outcome, code):
-    result = audit_result(outcome, against=COMPARISON)
+    result = audit_result(outcome, against=comparison(outcome))
     write_audit(tmp_path / "audit.json", result)
     assert read_audit(tmp_path / "audit.json") == result
     assert result.exit_code == code
@@ -46,6 +39,28 @@ def test_the_schema_is_one_and_refuses_what_the_model_refuses():
         ({"place": {**audit()["place"], "scale": None}}, "a judged object needs a known scale"),
         ({"strongest": None}, "found needs a judgement with the verdict's evidence"),
         ({"verdict": {**audit()["verdict"], "outcome": "worse"}}, "worse needs the comparison"),
+        (
+            {
+                "verdict": {**audit()["verdict"], "outcome": "worse"},
+                "against": comparison("found"),
+            },
+            "with a lower end above the margin",
+        ),
+        ({"against": comparison("worse")}, "such a comparison has no other verdict"),
+        (
+            {"verdict": {**audit()["verdict"], "outcome": "nothing_found", "evidence": "live"}},
+            "nothing_found needs a judgement with the verdict's evidence",
+        ),
+        (
+            {
+                "verdict": {**audit()["verdict"], "outcome": "nothing_found", "evidence": "surrogate"},
+                "strongest": {
+                    **audit()["strongest"],
+                    "judgements": [judged_drives("surrogate"), judged_drives("world")],
+                },
+            },
+            "the strongest evidence that was judged",
+        ),
         (
             {"verdict": {**audit()["verdict"], "outcome": "nothing_found"}, "planted": None},
             "needs a planted control",

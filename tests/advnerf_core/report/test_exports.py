@@ -14,22 +14,15 @@ from advnerf_core.report.exports.junit import HOLDS_PATH, write_junit
 from advnerf_core.report.exports.openscenario import write_openscenario
 from advnerf_core.report.exports.sarif import write_sarif
 from advnerf_core.report.exports.write import write_exports
-from tests.support.audits import audit, audit_result, judged_drives
+from tests.support.audits import audit, audit_result, comparison
 
-COMPARISON = {
-    "file": "old.json",
-    "sha256": "0" * 64,
-    "effect": judged_drives()["effect"],
-    "margin_m": 0.05,
-    "starts": 4,
-}
 NO_DRIVES = {"path": [], "route": []}
 
 
 def result_with(outcome="found", evidence="world", **drives):
     strongest = audit(evidence=evidence)["strongest"]
     strongest["judgements"][0] |= drives
-    return audit_result(outcome, evidence, strongest=strongest, against=COMPARISON)
+    return audit_result(outcome, evidence, strongest=strongest, against=comparison(outcome))
 
 
 def asam_issues(file):
