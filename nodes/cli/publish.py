@@ -71,6 +71,14 @@ def publish(
             "can drive the set again"
         )
     found_here = statuses(experiment, cells)
+    # Before anything is written: a wrong name leaves the folder as it was.
+    if withdraw:
+        finished = {each.cell.name for each in found_here if each.state == "done"}
+        registration.withdraw(
+            to / experiment.config.name, dict(_scenario_and_reason(each) for each in withdraw), finished
+        )
+    if declare:
+        victims.declare(to / experiment.config.name, dict(_scenario_and_reason(each) for each in declare))
     for each in found_here:
         if each.state == NOT_DRIVEN:
             say_error(
@@ -79,12 +87,6 @@ def publish(
     found = copy_cells(experiment, found_here, to, prune)
     for name in found.written:
         print(f"{to / experiment.config.name / name}.json")
-    if withdraw:
-        registration.withdraw(
-            to / experiment.config.name, dict(_scenario_and_reason(each) for each in withdraw)
-        )
-    if declare:
-        victims.declare(to / experiment.config.name, dict(_scenario_and_reason(each) for each in declare))
     if build:  # before the page, which says whether the set can be driven again
         _say_build(publish_build(experiment, cells, to, prune))
     part = verify_set(to / experiment.config.name) if registered else None

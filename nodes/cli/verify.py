@@ -44,6 +44,10 @@ def verify(
     from nodes.experiment.run.redrive import RedriveError
 
     if name is not None and (Path(name) / AUDIT).is_file():
+        if again:
+            raise ConfigError(
+                "expected no --redrive with the folder of an audit, of which nothing is driven again; leave it out"
+            )
         _audit(Path(name))
         return
     known = sets_in(published)
@@ -113,7 +117,7 @@ def _ledger(published: Path) -> int:
     """Let the benchmarks of the checkout that this is run in check rows and pages; how many problems there are."""
     from advnerf_core.documents import parse_json
 
-    root = published.resolve().parents[1]
+    root = published.resolve().parent.parent
     if root != Path.cwd() or not (root / "benchmarks" / "published_check.py").exists():
         print("rows and pages not checked: run it in the checkout, whose benchmarks compute them again")
         return 0

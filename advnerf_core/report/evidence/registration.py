@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon
@@ -121,6 +121,12 @@ class Contrast(StrictModel):
     after: str
     before_in: Domain = "deployed"
     after_in: Domain = "deployed"
+
+    @model_validator(mode="after")
+    def _of_two(self) -> Contrast:
+        if (self.before, self.before_in) == (self.after, self.after_in):
+            raise ValueError(f"expected two conditions, got {self.before} {self.before_in} twice")
+        return self
 
 
 class PlaceClaim(StrictModel):
@@ -243,15 +249,28 @@ def read_reasons(file: FilePath, what: str) -> dict[str, str]:
     return dict(found)
 
 
-def withdraw(folder: FilePath, scenarios: Mapping[str, str]) -> None:
-    """Withdraw registered scenarios, with reasons that the page of results shows.
+def require_registration(folder: FilePath) -> Registration:
+    """The registration in the folder of a set.
 
     Raises:
-        SetError: A scenario was not registered, has no reason, or already has results: these are published, good or bad.
+        SetError: There is none, or it is damaged.
     """
     registration = read_registration(folder)
     if registration is None:
         raise SetError(f"{folder}: expected {FILE}, which advnerf experiment register writes, got none")
+    return registration
+
+
+def withdraw(folder: FilePath, scenarios: Mapping[str, str], finished: Collection[str] = ()) -> None:
+    """Withdraw registered scenarios, with reasons that the page of results shows.
+
+    Args:
+        finished: Names of cells that are finished and not published yet.
+
+    Raises:
+        SetError: A scenario was not registered, has no reason, or already has results: these are published, good or bad.
+    """
+    registration = require_registration(folder)
     names = {cell.scenario for cell in registration.cells}
     for scenario, reason in scenarios.items():
         if scenario not in names:
@@ -263,8 +282,10 @@ def withdraw(folder: FilePath, scenarios: Mapping[str, str]) -> None:
         there = [
             cell.name
             for cell in registration.cells
-            if cell.scenario == scenario and (folder / f"{cell.name}.json").exists()
+            if cell.scenario == scenario
+            and (cell.name in finished or (folder / f"{cell.name}.json").exists())
         ]
         if there:
-            raise SetError(f"{scenario} cannot be withdrawn, as {there[0]} was published; publish all of it")
+            how = "is finished" if there[0] in finished else "was published"
+            raise SetError(f"{scenario} cannot be withdrawn, as {there[0]} {how}; publish all of it")
     write_json(folder / WITHDRAWN, {**read_withdrawn(folder), **scenarios})

@@ -17,12 +17,10 @@ from advnerf_core.report.evidence.anytime import AnytimeTest, anytime_test
 from advnerf_core.report.evidence.exact import McNemar, holm, mcnemar_per_search, permutation_test
 from advnerf_core.report.evidence.intervals import ClusteredInterval, difference_interval
 from advnerf_core.report.evidence.registration import (
-    FILE,
     PrimaryTest,
     RegisteredScenario,
     Registration,
-    SetError,
-    read_registration,
+    require_registration,
     scenario_key,
 )
 from advnerf_core.report.evidence.rows import CellDrives, Key, Outcome, Row, make_row
@@ -160,10 +158,7 @@ def read_evidence(folder: Path) -> Evidence:
         SetError: The folder has no registration, or it is damaged.
         CellError: A cell is damaged.
     """
-    registration = read_registration(folder)
-    if registration is None:
-        raise SetError(f"{folder}: expected {FILE}, which advnerf experiment register writes, got none")
-    return Evidence(registration, read_cells(folder))
+    return Evidence(require_registration(folder), read_cells(folder))
 
 
 def rows(evidence: Evidence) -> list[Row]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.evidence.contrasts import contrast_data, contrast_rows
@@ -29,6 +30,11 @@ def replace(cell: CellResult, **values: Any) -> CellResult:
 
 LEARNED = Contrast(name="learned scene to world", before="track", before_in="surrogate", after="track")
 RENDERER = Contrast(name="another renderer", before="track", after="native")
+
+
+def test_a_condition_is_not_compared_with_itself():
+    with pytest.raises(ValidationError, match="expected two conditions, got track deployed twice"):
+        Contrast(name="nothing", before="track", after="track")
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import random
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from advnerf_core.report.evidence.verifying.victims import DECLARED, declare
 from benchmarks.planting.simulated import write_simulated_set
 from benchmarks.planting.world import World, poses_of
 from nodes.cli.main import app
+from nodes.cli.verify import _ledger
 from tests.support.published import write_set
 
 
@@ -82,6 +84,68 @@ def test_a_missing_cell_and_a_strange_file_are_named(copied):
     problems = "\n".join(verify_set(copied).problems)
     assert "track_hardened_gradient_3: was registered, and is not there" in problems
     assert "track_hardened_other_4.json: is not listed" in problems
+
+
+def test_a_file_is_of_the_cell_that_it_is_named_after(copied):
+    """Of two files of one cell the last one counted, and files that were exchanged were taken."""
+    first, second = copied / "track_hardened_gradient_0.json", copied / "track_hardened_gradient_1.json"
+    copy = shutil.copy(first, copied / "track_hardened_gradient_0 (copy).json")
+    with pytest.raises(
+        SetError, match=r"\(copy\)\.json: expected the cell of this name, got track_hardened_gradient_0"
+    ):
+        write_set(copied)
+    copy.unlink()
+    texts = first.read_text(), second.read_text()
+    first.write_text(texts[1])
+    second.write_text(texts[0])
+    problems = verify_set(copied).problems
+    for file, other in ((first, second), (second, first)):
+        assert any(
+            text.startswith(f"{file}: expected the cell of this name, got {other.stem}") for text in problems
+        )
+
+
+def no_poses(data):
+    data["kept"]["deployed"][0].update(x_m="", y_m="", yaw_rad="")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda data: data["extra"].update(max_abs_cte_m=float("nan")), "expected a largest |CTE| of"),
+        (lambda data: data["extra"].update(max_abs_cte_m="0.7"), "expected a largest |CTE| of"),
+        (lambda data: data["extra"].update(blocked_tick=5), "whether its drives ended against something"),
+        (no_poses, "expected 61 poses, got 0"),
+    ],
+)
+def test_a_value_of_another_kind_is_a_problem_and_no_crash(copied, change, says):
+    file = copied / "track_hardened_gradient_0.json"
+    data = json.loads(file.read_text())
+    change(data)
+    file.write_text(json.dumps(data))
+    assert any(says in problem for problem in verify_set(copied).problems)
+    with pytest.raises(SetError, match="cannot be published"):
+        write_set(copied)
+
+
+@pytest.mark.parametrize("text", ["[]", "null", '{"simulated": 1}'])
+def test_a_manifest_of_another_form_is_a_problem_and_no_crash(copied, text):
+    for name in (BESIDE, DIGESTS):
+        file = copied.parent / name
+        before = file.read_text()
+        file.write_text(text)
+        assert f"{file}: expected a digest for each name" in verify_beside(copied.parent)[0]
+        file.write_text(before)
+    (copied / SET).write_text(
+        json.dumps({**json.loads((copied / SET).read_text()), "files": json.loads(text)})
+    )
+    assert any("expected a digest for each name" in problem for problem in verify_set(copied).problems)
+
+
+@pytest.mark.parametrize("place", ["/", "/tmp"])
+def test_a_folder_that_cannot_lie_in_a_checkout_has_no_rows_to_check(place, capsys):
+    assert _ledger(Path(place)) == 0
+    assert "rows and pages not checked" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -311,6 +375,9 @@ def test_a_scenario_that_was_given_up_is_told_with_its_reason_and_counts_against
     page = (half_run.parent / PAGE).read_text()
     assert "**Registered, and not run:** later, with 13 cells and 1 of the primary tests" in page
     assert "It would have taken two days." in page
+    # What was not registered cannot be withdrawn by hand.
+    (half_run / WITHDRAWN).write_text(json.dumps({"later": "It would have taken two days.", "other": "No."}))
+    assert "other: was withdrawn, and was not registered" in verify_set(half_run).problems
     # The reason cannot be changed or dropped unnoticed.
     (half_run / WITHDRAWN).write_text(json.dumps({"later": "No matter."}))
     assert any(WITHDRAWN in each for each in verify_set(half_run).problems)
@@ -333,6 +400,12 @@ def test_results_and_strangers_cannot_be_withdrawn(half_run, scenarios, says):
     with pytest.raises(SetError) as error:
         withdraw(half_run, scenarios)
     assert says in str(error.value)
+    assert not (half_run / WITHDRAWN).exists()
+
+
+def test_a_scenario_with_a_finished_cell_cannot_be_withdrawn(half_run):
+    with pytest.raises(SetError, match="later cannot be withdrawn, as later_hardened_none_0 is finished"):
+        withdraw(half_run, {"later": "It did not come out well."}, ["later_hardened_none_0"])
     assert not (half_run / WITHDRAWN).exists()
 
 
@@ -376,6 +449,14 @@ def test_a_victim_that_does_not_drive_well_is_published_only_if_that_is_declared
     assert "Its car swings by itself." in page
     (folder / DECLARED).unlink()
     assert any("publish with --declare own.hardened=REASON" in each for each in verify_set(folder).problems)
+
+
+def test_a_victim_that_was_not_registered_is_not_declared(copied):
+    with pytest.raises(
+        SetError, match=r"expected a registered victim \(track\.hardened, .*\) to declare, got 'own\.harden'"
+    ):
+        declare(copied, {"own.hardened": "Its car swings.", "own.harden": "Its car swings."})
+    assert not (copied / DECLARED).exists()
 
 
 def test_who_drives_well_is_not_declared_otherwise(copied):

@@ -18,6 +18,7 @@ from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.evidence.registration import read_withdrawn, scenario_key
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verifying.drives import drive_problems
+from advnerf_core.report.evidence.verifying.layout import cell_files
 from advnerf_core.report.evidence.verifying.registered import build_problems, cell_problems, missing_cells
 from advnerf_core.report.evidence.verifying.victims import declaration_problems, read_declared
 
@@ -30,7 +31,12 @@ def set_problems(folder: Path, evidence: Evidence, under_way: bool = False) -> I
     damaged, withdrawn = under_way, read_withdrawn(folder)
     missing = [] if under_way else missing_cells(evidence, withdrawn)
     absent = (f"{name}: was registered, and is not there" for name in missing)
-    for check in (absent, cell_problems(evidence, withdrawn), drive_problems(evidence)):
+    for check in (
+        absent,
+        _name_problems(folder, evidence),
+        cell_problems(evidence, withdrawn),
+        drive_problems(evidence),
+    ):
         for problem in check:
             damaged = True
             yield problem
@@ -40,6 +46,13 @@ def set_problems(folder: Path, evidence: Evidence, under_way: bool = False) -> I
     yield from _gate_problems(folder, evidence)
     if not damaged:
         yield from declaration_problems(evidence, read_declared(folder))
+
+
+def _name_problems(folder: Path, evidence: Evidence) -> Iterator[str]:
+    """Whether each file is of the cell that it is named after: of two files of one cell, only one would count."""
+    for file, cell in zip(cell_files(folder), evidence.all_cells, strict=True):
+        if file.stem != cell.name:
+            yield f"{file}: expected the cell of this name, got {cell.name}; restore both from git, or remove the copy"
 
 
 def _search_problems(evidence: Evidence) -> Iterator[str]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import sha256_of, write_json
+from advnerf_core.report.evidence.registration import SetError
 from advnerf_core.report.evidence.verifying.layout import BESIDE, DIGESTS, SET, sets_in
 
 # Its pages are recomputed from the listed files, and the log of removals only ever grows.
@@ -31,10 +33,7 @@ def digests_beside(published: Path) -> dict[str, str]:
 def known_digests(published: Path) -> dict[str, str]:
     """Digest of each set's manifest, by name of the set."""
     file = published / DIGESTS
-    if not file.exists():
-        return {}
-    known: dict[str, str] = read_json(file)
-    return known
+    return _listed(read_json(file), file) if file.exists() else {}
 
 
 def write_known_digest(folder: Path) -> None:
@@ -53,7 +52,7 @@ def file_problems(folder: Path) -> Iterator[str]:
     """Whether a set's files match its manifest, and the manifest is the published one."""
     file = folder / SET
     try:
-        listed = read_json(file)["files"]
+        listed = _listed(read_json(file)["files"], file)
         known = known_digests(folder.parent).get(folder.name)
     except (OSError, ValueError, KeyError, TypeError) as error:
         yield f"{file}: cannot be read: {error}"
@@ -66,7 +65,7 @@ def file_problems(folder: Path) -> Iterator[str]:
 def beside_problems(published: Path) -> Iterator[str]:
     """Whether pictures, films, the reference build and sets without a registration match their manifest."""
     try:
-        listed = read_json(published / BESIDE)
+        listed = _listed(read_json(published / BESIDE), published / BESIDE)
         missing = sorted(known_digests(published).keys() - sets_in(published))
     except (OSError, ValueError) as error:
         yield f"{published / BESIDE}: cannot be read: {error}; advnerf experiment publish writes it"
@@ -74,6 +73,13 @@ def beside_problems(published: Path) -> Iterator[str]:
     yield from (f"{published / name}: is listed in {DIGESTS}, and has no registration" for name in missing)
     for problem in _compared(published, BESIDE, listed, digests_beside(published)):
         yield f"{problem}; restore it from git, or, if the change is meant: python -m benchmarks.set_pages --page"
+
+
+def _listed(found: Any, file: Path) -> dict[str, str]:
+    """Digests by name, of a file that was read; a `SetError` names it if it holds something else."""
+    if not isinstance(found, dict) or not all(isinstance(digest, str) for digest in found.values()):
+        raise SetError(f"{file}: expected a digest for each name, got {found!r:.60}; restore it from git")
+    return found
 
 
 def _compared(

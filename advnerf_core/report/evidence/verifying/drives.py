@@ -84,6 +84,7 @@ def _starts(
         poses = drive.poses()
         if len(poses) != scenario.ticks + 1 or drive.driven_ticks > scenario.ticks:
             yield f"{where}, start {number}: expected {scenario.ticks + 1} poses, got {len(poses)}"
+            continue
         off_m = float(np.hypot(*(poses[0, :2] - start[:2])))
         turned_rad = abs(float(wrap_angle(poses[0, 2] - start[2])))
         if off_m > near_m or turned_rad > near_rad:
@@ -146,10 +147,12 @@ def _largest(evidence: Evidence, cell: CellResult) -> Iterator[str]:
     said_m = cell.extra.get("max_abs_cte_m")
     if said_m is not None and found:
         largest_m = max(each.max_cte_m for each in found)
-        if abs(largest_m - said_m) > _TOTAL_TOLERANCE_M:
-            yield f"{cell.name}: expected a largest |CTE| of {largest_m:.3f} m as its poses say, got {said_m:.3f}"
+        # NaN, and what is no number, are not near.
+        if not isinstance(said_m, int | float) or not abs(largest_m - said_m) <= _TOTAL_TOLERANCE_M:
+            yield f"{cell.name}: expected a largest |CTE| of {largest_m:.3f} m as its poses say, got {said_m!r}"
     blocked = cell.extra.get("blocked_tick")
-    if blocked is not None and [each is not None for each in blocked] != [
-        each.collided for each in cell.kept.get("deployed", ())
-    ]:
+    ended = [each.collided for each in cell.kept.get("deployed", ())]
+    if blocked is not None and (
+        not isinstance(blocked, list) or [each is not None for each in blocked] != ended
+    ):
         yield f"{cell.name}: whether its drives ended against something is not what it says of them"

@@ -20,6 +20,8 @@ def missing_cells(evidence: Evidence, withdrawn: Collection[str]) -> list[str]:
 def cell_problems(evidence: Evidence, withdrawn: Collection[str]) -> Iterator[str]:
     """Whether no cell passes for registered that is not, and none is of a withdrawn scenario."""
     there = {cell.name for cell in evidence.all_cells}
+    for scenario in sorted(set(withdrawn) - {cell.scenario for cell in evidence.registration.cells}):
+        yield f"{scenario}: was withdrawn, and was not registered"
     for wanted in evidence.registration.cells:
         name = wanted.name
         if wanted.scenario in withdrawn:

@@ -10,7 +10,12 @@ import numpy as np
 
 from advnerf_core.files import write_json
 from advnerf_core.report.conditions import NONE
-from advnerf_core.report.evidence.registration import SetError, read_reasons, scenario_key
+from advnerf_core.report.evidence.registration import (
+    SetError,
+    read_reasons,
+    require_registration,
+    scenario_key,
+)
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.reference import DOMAINS
 
@@ -59,9 +64,12 @@ def declare(folder: Path, victims: Mapping[str, str]) -> None:
     """Declare that victims do not drive well, with the reason for showing them.
 
     Raises:
-        SetError: A victim has no reason.
+        SetError: A victim was not registered, or has no reason.
     """
+    known = dict.fromkeys(victim_key(vars(cell)) for cell in require_registration(folder).cells)
     for victim, reason in victims.items():
+        if victim not in known:
+            raise SetError(f"expected a registered victim ({', '.join(known)}) to declare, got {victim!r}")
         if not reason.strip():
             raise SetError(f"expected a reason for showing {victim}; give {victim}=REASON")
     write_json(folder / DECLARED, {**read_declared(folder), **victims})
