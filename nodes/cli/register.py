@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from nodes.cli.cell_choice import CellChoice, File, Folder, Only, Setting, load_cells
 from nodes.runtime.terminal import Overrides
@@ -16,22 +13,18 @@ def register(
     setting: Setting = None,
     folder: Folder = None,
     only: Only = None,
-    published: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            help="Folder of all published sets; gets a folder with the experiment's name.",
-            exists=True,
-            file_okay=False,
-        ),
-    ] = Path("docs/results"),
     overrides: Overrides = None,
 ) -> None:
-    """Write down what an experiment will run, and which tests will be claimed, before anything is run."""
+    """Write down in docs/results what an experiment will run, and which tests will be claimed, before anything is run."""
     from advnerf_core.report.evidence.registration import FILE
+    from nodes.experiment.engine.artefact import PUBLISHED as published
     from nodes.experiment.run.registering import register as write_registration
+    from nodes.runtime.errors import ConfigError
 
+    if not published.is_dir():  # cells are run under what is registered there, and nowhere else
+        raise ConfigError(
+            f"expected the folder of published sets, {published}, in the working folder {Path.cwd()}, found none; change to your checkout, or make it"
+        )
     experiment, cells = load_cells(CellChoice(file, setting, folder, only, overrides))
     found = write_registration(experiment, cells, published)
     print(f"{published / found.name / FILE}: {found.digest[:12]}")

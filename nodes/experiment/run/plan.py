@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from advnerf_core.report.evidence.registration import RegisteredCell, Registration, read_registration
+from advnerf_core.report.evidence.registration import (
+    FILE,
+    RegisteredCell,
+    Registration,
+    launch_file,
+    read_registration,
+)
 from nodes.experiment.engine.artefact import PUBLISHED, Settings
 from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.plan.cell import Cell
@@ -15,6 +22,9 @@ from nodes.experiment.run.worker import Job
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.keys import registered_settings, settings_hash
 from nodes.runtime.errors import ConfigError, RuntimeFault
+
+# In a message.
+_MOST_DIFFERENCES = 5
 
 
 def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Job]:
@@ -45,6 +55,42 @@ def registered_under(registration: Registration | None, cell: Cell, settings: Se
     scenario = registration.scenario(cell.scenario)
     same = scenario is not None and scenario.settings_sha256 == settings.key
     return registration.digest if same else ""
+
+
+def not_registered(experiment: Experiment, cells: Sequence[Cell]) -> str:
+    """How many cells will be no evidence, as their file and setting were registered with other values; empty if none."""
+    registration = read_registration(PUBLISHED / experiment.config.name)
+    there = (experiment.file.name, experiment.setting)
+    if registration is None or there != (launch_file(registration.file), registration.setting):
+        return ""
+    outside = [
+        cell
+        for cell in cells
+        if registered_cell(cell) in registration.cells
+        and not registered_under(registration, cell, registered_settings(experiment.of(cell)))
+    ]
+    if not outside:
+        return ""
+    scenario = registration.scenario(outside[0].scenario)
+    then = {} if scenario is None else scenario.settings
+    differ = _differences(then, registered_settings(experiment.of(outside[0])).resolved) if then else []
+    why = f": {', '.join(differ[:_MOST_DIFFERENCES])}" if differ else ""
+    return (
+        f"{len(outside)} cells are not run under the registration {PUBLISHED / registration.name / FILE}, and cannot be published in its set, as their "
+        f"settings differ{why}"
+    )
+
+
+def _differences(then: Mapping[str, Any], now: Mapping[str, Any], above: str = "") -> list[str]:
+    """The keys in which settings differ, dotted, with both values."""
+    found = []
+    for name in sorted(then.keys() | now.keys()):
+        before, after = then.get(name), now.get(name)
+        if isinstance(before, dict) and isinstance(after, dict):
+            found += _differences(before, after, f"{above}{name}.")
+        elif before != after:
+            found.append(f"{above}{name} {after!r:.40} instead of {before!r:.40}")
+    return found
 
 
 def registered_cell(cell: Cell) -> RegisteredCell:

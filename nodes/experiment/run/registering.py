@@ -118,7 +118,7 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
     of a claim over places: that samples places, not the searches at one of them.
 
     Raises:
-        SetError: A place with a baseline lacks others that a test needs.
+        SetError: A place with a baseline lacks others that a test needs, or nothing is deployed there.
     """
     tests = []
     sampled = {name for each in experiment.config.claims for name in each.scenarios}
@@ -130,6 +130,11 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
         against = [name for name in methods if name not in (GRADIENT, COARSE_GRADIENT)]
         if GRADIENT not in methods or not against:
             continue
+        if config.deploy.through == "nothing":
+            raise SetError(
+                f"{scenario}: expected deploy.through world or nodes, as its tests are about deployed drives, got nothing; deploy them, or leave "
+                f"{GRADIENT} or its baselines out of the methods"
+            )
         families = unseen(RANDOM_FAMILIES, config)
         lacking = lacking_baselines(methods, _coarse_cells_differ(config), families)
         if lacking:

@@ -16,7 +16,7 @@ from rich.console import Console
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.admission import past_the_gate
 from nodes.experiment.run.cells import Bench, needed_settings
-from nodes.experiment.run.plan import elsewhere, plan_cells
+from nodes.experiment.run.plan import elsewhere, not_registered, plan_cells
 from nodes.experiment.run.store import NOT_DRIVEN, Store
 from nodes.experiment.run.worker import Ended, Job, Phase, run_here, run_in_process, wait_for_live
 from nodes.experiment.show.context import Experiment
@@ -100,6 +100,8 @@ def run_cells(
             f"nothing to do: {'every cell is' if there == len(plan) else f'{there} of {len(plan)} cells are'} there"
         )
         return []
+    if text := not_registered(experiment, [each.cell for each in wanted]):
+        say(text)
     if options.here:
         return _run_here(store, wanted, experiment, options, say, ProgressDisplay(console, watcher))
     jobs, threads = _shares(options)

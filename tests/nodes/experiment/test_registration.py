@@ -2,17 +2,22 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from advnerf_core.report.evidence.families import coarse_cells_differ
 from advnerf_core.report.evidence.registration import FILE, PlaceClaim, SetError, read_registration
+from nodes.cli.main import app
 from nodes.experiment.engine.artefact import Settings, write_key
+from nodes.experiment.run import plan
 from nodes.experiment.run.plan import plan_cells, registered_under
 from nodes.experiment.run.registering import primary_tests, register, registered_scenario
 from nodes.experiment.steps.keys import registered_settings
 from tests.support.stage_versions import tiny_experiment
 
+LAUNCH = Path(__file__).parents[3] / "launch"
 GRADIENT = "right_hardened_gradient_0"
 FAMILIES = ("random_coarse", "random_levels", "random_pink")
 METHODS = ("random", *FAMILIES, "cem", "gradient")
@@ -71,6 +76,16 @@ def test_a_test_needs_three_unseen_families_and_a_coarse_search(trained, tmp_pat
     assert f"add {lacks} to the methods" in str(refused.value)
 
 
+def test_tests_of_deployed_drives_need_deployed_drives(trained, tmp_path):
+    """The set could be run, and not be published."""
+    nothing = {"deploy": trained.config.deploy.model_copy(update={"through": "nothing"})}
+    made = made_of(trained, tmp_path, METHODS, **nothing)
+    with pytest.raises(SetError, match=r"right: expected deploy\.through world or nodes, .* got nothing"):
+        register(made, [cell for cell in made.cells if cell.scenario == "right"], tmp_path)
+    made = made_of(trained, tmp_path, ("gradient",), **nothing)
+    assert primary_tests(made, made.cells) == []
+
+
 def test_a_place_of_a_claim_over_places_has_no_test_of_its_own(trained, tmp_path):
     places = ("right", "left", "elsewhere", "and_there")
     over_places = PlaceClaim(
@@ -110,6 +125,32 @@ def test_where_coarse_textures_have_other_cells_the_gradient_is_run_in_both(tmp_
 def test_a_registration_says_whether_coarse_textures_have_other_cells(tmp_path, changes, differ):
     made = tiny_experiment(tmp_path / "run", changes)
     assert coarse_cells_differ(registered_scenario(made, "track")) == differ
+
+
+def test_cells_of_a_registered_file_with_other_values_are_named_before_they_are_run(tmp_path, monkeypatch):
+    """They would be run for hours, and refused when they are published."""
+    methods = f"over.method=[none,{','.join(FAMILIES)},cem,gradient]"
+    made = tiny_experiment(tmp_path / "run", ["space.cells=0", methods])
+    monkeypatch.setattr(plan, "PUBLISHED", tmp_path)
+    assert plan.not_registered(made, made.cells) == ""
+    register(made, made.cells, tmp_path)
+    assert plan.not_registered(made, made.cells) == ""
+    other = tiny_experiment(tmp_path / "run", ["space.cells=0", methods, "attack.evaluations=3", "horizon=9"])
+    said = plan.not_registered(other, other.cells)
+    assert said.startswith(f"{len(other.cells)} cells are not run under the registration {tmp_path}")
+    assert said.endswith(
+        "as their settings differ: attack.evaluations 3 instead of 2, horizon 9 instead of 8"
+    )
+    # Another setting of the file is no mistake.
+    assert plan.not_registered(replace(other, setting="quick"), other.cells) == ""
+
+
+def test_registering_names_the_folder_that_runs_look_into(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = CliRunner().invoke(app, ["experiment", "register", str(LAUNCH / "room.experiment.yaml")])
+    assert f"expected the folder of published sets, docs/results, in the working folder {tmp_path}" in str(
+        found.exception
+    )
 
 
 def test_a_registration_after_the_fact_is_refused(experiment, tmp_path):
