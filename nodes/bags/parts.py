@@ -30,6 +30,11 @@ def holds_bag(folder: Path) -> bool:
     return bool(_files(Path(folder)))
 
 
+def is_bag_file(file: Path) -> bool:
+    """Whether a file stands for a bag by its name."""
+    return file.suffix.lower() in SUFFIXES or file.name == METADATA_FILE
+
+
 def bag_parts(bag: Path) -> tuple[Path, ...]:
     """Return the files of a bag in the order of their recording.
 

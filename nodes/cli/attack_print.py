@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import print_table, table
 
 if TYPE_CHECKING:
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from nodes.lab.wizards.prints import MeasuredPrint
 
 
+@with_groups
 def attack_print(
     file: Annotated[Path, typer.Argument(help="An attack file.", exists=True, dir_okay=False)],
     output: Annotated[
@@ -70,6 +73,7 @@ def attack_print(
         print(f"written: {beside[1]}, the sizes for 'advnerf attack measure'")
 
 
+@with_groups
 def attack_measure(
     source: Annotated[
         Path,
@@ -168,7 +172,8 @@ def _pose(text: str | None) -> tuple[float, float, float] | None:
         return None
     try:
         x_m, y_m, yaw_rad = map(float, text.split(","))
-        within_a_turn(yaw_rad)
+        if not all(map(math.isfinite, (x_m, y_m, within_a_turn(yaw_rad)))):
+            raise ValueError("expected finite numbers")
     except ValueError:
         raise CalibrationError(
             f"expected --car X,Y,YAW in m and rad, such as 1.2,-0.4,3.1; got {text!r}"

@@ -32,6 +32,7 @@ from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
 from nodes.experiment.node.printed import record_beside
 from nodes.experiment.node.search import run_attack
+from nodes.lab.wizards.prints import MeasuredPrint, write_measured
 from nodes.runtime.messages import encode, image_message, pose_message
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.faces import face_attack
@@ -195,6 +196,17 @@ def test_damaged_and_irrelevant_files_are_refused_in_one_line(call, folder, meas
     assert not list(folder.glob("*.measured.*"))
 
 
+@pytest.mark.parametrize("name", ["photo.webp", "IMG_1.HEIC", "photo"])
+def test_a_picture_of_any_kind_is_no_bag(call, folder, name):
+    call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 20)
+    (folder / name).write_bytes(b"no picture")
+    code, said = call(
+        "attack", "measure", folder / name, "--print", folder / "p.print.json", "--camera", folder / "lens.yaml",
+        "--distance", "1",
+    )  # fmt: skip
+    assert (code, "expected a readable image" in said) == (2, True), said
+
+
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory):
     """A request of the simulated lab's camera, and its attack."""
@@ -246,11 +258,30 @@ def test_a_drive_gives_size_pose_flatness_and_the_effect_where_it_hangs(call, se
 def test_a_yaw_in_degrees_is_refused(call, folder):
     (folder / "photo.png").touch()
     call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 20)
-    code, said = call(
-        "attack", "measure", folder / "photo.png", "--print", folder / "p.print.json", "--camera", folder / "lens.yaml",
-        "--car", "1,2,90",
-    )  # fmt: skip
-    assert (code, "in m and rad" in said) == (2, True), said
+    measuring = (
+        "attack",
+        "measure",
+        folder / "photo.png",
+        "--print",
+        folder / "p.print.json",
+        "--camera",
+        folder / "lens.yaml",
+    )
+    for car in ("1,2,90", "1,nan,0", "inf,2,0"):
+        code, said = call(*measuring, "--car", car)
+        assert (code, "in m and rad" in said) == (2, True), said
+    for option in ("--width", "--distance"):  # Python reads it as a number
+        code, said = call(*measuring, option, "inf")
+        assert (code, f"expected finite numbers for {option}, got inf" in said) == (2, True), said
+
+
+def test_no_picture_of_an_earlier_measurement_stays(tmp_path):
+    pose = PrintPose(before_camera(0.9), (1, 2, 3), (), *[0.0] * 6, aspect=1.0)
+    measurement = of_photograph("p.png", (0.4, 0.4), 12, pose, None, None)
+    (tmp_path / "p.measured.png").touch()
+    target = tmp_path / "p.measured.json"
+    assert write_measured(MeasuredPrint(measurement, None, False), None, target) == [target]
+    assert list(tmp_path.iterdir()) == [target]
 
 
 def test_no_input_is_overwritten(call, folder):

@@ -89,6 +89,11 @@ def test_a_png_and_a_page_of_the_posters_size(printed, tmp_path):
     ("arguments", "message"),
     [
         (["-o", "poster.jpg"], "expected a .pdf or .png file to write, got poster.jpg; correct --output"),
+        (
+            ["--marker-mm", 500],
+            "expected markers of at most 400 mm, the texture's shorter side, as larger ones would touch, got 500 mm",
+        ),
+        (["--object-size", "inf"], "expected finite numbers for --object-size, got inf"),
         (["--marker-mm", 5], "expected a value greater than or equal to 8, got '5'"),
         (["--margin-mm", 1], "expected a margin of 4 to 40 mm"),
         (["--object", "car"], "expected an object of face; got 'car'"),

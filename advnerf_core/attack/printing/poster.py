@@ -90,9 +90,18 @@ class Poster(Printable):
 
         Args:
             marker_m: Side of a marker [m]; None for a share of the picture.
+
+        Raises:
+            PrintError: The markers are larger than the picture: they would touch or cover each other.
         """
         number = int(self.attack.attack_id, 16) % CHART_SET
-        return replace(self, frame=frame_around(self.size_m, number, marker_m))
+        frame = frame_around(self.size_m, number, marker_m)
+        if frame.marker_m > min(self.size_m):
+            raise PrintError(
+                f"expected markers of at most {min(self.size_m) * MM_PER_M:g} mm, the texture's shorter side, as larger ones would touch, got "
+                f"{frame.marker_m * MM_PER_M:g} mm; correct --marker-mm, or add --no-markers"
+            )
+        return replace(self, frame=frame)
 
 
 def poster_of(attack: AttackFile, name: str | None = None, edge_m: float | None = None) -> Poster:

@@ -24,6 +24,7 @@ FOOTER_MM = 10.0
 _LEAST_MARGIN_MM, _LARGEST_MARGIN_MM, _LARGEST_OVERLAP_MM = 4.0, 40.0, 50.0
 # Readers of PDF refuse larger pages (ISO 32000-1, annex C: 14,400 units).
 _LARGEST_PAGE_MM = 5080.0
+_MOST_PAGES = 1000
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def layout_of(size_mm: tuple[float, float], paper: Paper, margin_mm: float, over
         overlap_mm: Overlap of neighbouring tiles [mm].
 
     Raises:
-        PrintError: A margin or overlap that leaves no room, or a page that PDF does not support.
+        PrintError: A margin or overlap that leaves no room, a page that PDF does not support, or more pages than anyone glues.
     """
     if paper == "none":
         if max(size_mm) > _LARGEST_PAGE_MM:
@@ -103,8 +104,14 @@ def layout_of(size_mm: tuple[float, float], paper: Paper, margin_mm: float, over
         )
     width_mm, height_mm = PAPERS_MM[paper]
     pages = [(width_mm, height_mm), (height_mm, width_mm)]
-    found = [_divided(size_mm, page_mm, margin_mm, overlap_mm) for page_mm in pages]
-    return min(found, key=lambda each: each.rows * each.columns)
+    layouts = [_divided(size_mm, page_mm, margin_mm, overlap_mm) for page_mm in pages]
+    found = min(layouts, key=lambda each: each.rows * each.columns)
+    if (count := found.rows * found.columns) > _MOST_PAGES:
+        raise PrintError(
+            f"expected at most {_MOST_PAGES} pages, got {count} of {paper.title()} for {size_mm[0] / 1000:g} x {size_mm[1] / 1000:g} m; choose a larger "
+            "--paper, or correct --object-size, which is in metres"
+        )
+    return found
 
 
 def _divided(

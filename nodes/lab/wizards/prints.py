@@ -32,7 +32,8 @@ from calibration.print_measurement import (
 )
 from calibration.print_pose import PrintPose, fit_print
 from calibration.schema import CalibrationError, CameraCalibration, Intrinsics, load_calibration
-from nodes.lab.wizards.bags import CAR, PICTURES, read_frames, read_picture, read_poses
+from nodes.bags.parts import is_bag_file
+from nodes.lab.wizards.bags import CAR, read_frames, read_picture, read_poses
 from nodes.lab.wizards.lens import load_lens
 
 Rgb = NDArray[np.uint8]
@@ -121,7 +122,9 @@ def measure(
         PrintError: The record is of another print.
     """
     sheet = printed_sheet(record, attack)
-    if source.is_file() and source.suffix.lower() in PICTURES:
+    if source.is_file() and not is_bag_file(
+        source
+    ):  # phones write .heic, and there are pictures without any suffix
         lens = load_lens(camera) if known.car is None else load_calibration(CameraCalibration, camera)
         return _measure_photograph(source, record, sheet, lens, known)
     if known != KnownLength():
@@ -144,9 +147,10 @@ def write_measured(found: MeasuredPrint, effect: PlainData | None, path: Path) -
     """
     data = found.measurement.to_dict() | ({} if effect is None else {"effect": effect.to_dict()})
     write_json(path, data)
-    if found.colours is None:
-        return [path]
     picture = measured_files(path)[1]
+    if found.colours is None:
+        picture.unlink(missing_ok=True)  # of an earlier measurement
+        return [path]
     row = np.concatenate([found.colours.nominal, found.colours.seen, found.colours.unlit], axis=1)
     write_image(picture, row.repeat(4, axis=0).repeat(4, axis=1))
     return [path, picture]

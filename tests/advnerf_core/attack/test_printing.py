@@ -242,8 +242,20 @@ def test_impossible_measures_are_refused():
         layout_of((500.0, 350.0), "a4", 8.0, 60.0)
     with pytest.raises(PrintError, match=r"at most 5\.08 m"):
         layout_of((6000.0, 350.0), "none", 8.0, 5.0)
+    with pytest.raises(
+        PrintError, match=r"at most 1000 pages, got \d+ of A4 for 60 x 40 m; .* which is in metres"
+    ):
+        layout_of((60_000.0, 40_000.0), "a4", 8.0, 5.0)
     big = poster_of(of(panel("board", (3.0, 3.0))))
     with pytest.raises(PrintError, match=r"at most 200 million pixels .* use --dpi (\d+)") as refused:
         png_bytes(big, 600.0)
     fits = int(re.findall(r"--dpi (\d+)", str(refused.value))[0])
     assert 115 <= fits <= 119
+
+
+@pytest.mark.parametrize(("edge_m", "marker_m", "most"), [(0.3, 0.31, "300 mm"), (0.015, None, "15 mm")])
+def test_markers_that_would_touch_are_refused(edge_m, marker_m, most):
+    small = poster_of(of(panel("board", (edge_m, 2.0 * edge_m))))
+    with pytest.raises(PrintError, match=f"expected markers of at most {most}, .* or add --no-markers"):
+        small.with_markers(marker_m)
+    assert small.with_markers(0.5 * edge_m).frame.marker_m == 0.5 * edge_m
