@@ -134,6 +134,7 @@ def check_audit(folder: Path) -> list[str]:
 def _check(folder: Path, result: AuditResult, said: AuditedDrives, kept: KeptDrives) -> str:
     limit_m, drives = kept.horizon.off_track_m, kept.arms
     _same(folder, "place.off_track_m", result.place.off_track_m, limit_m)
+    _same(folder, "starts.judging.count", result.starts.judging.count, len(said.starts))
     numbers: dict[str, Any] = numbers_of(drives, limit_m, kept.horizon.dt_s)
     _same(folder, f"{said.evidence}: disturbed", said.disturbed is not None, FOUND_DISTURBED in drives)
     if said.disturbed is not None:

@@ -207,6 +207,20 @@ def scenario_key(name: str, placement: str) -> str:
     return f"{name}.{placement}" if placement else name
 
 
+def settings_differences(
+    registered: Mapping[str, Any], found: Mapping[str, Any], above: str = ""
+) -> list[str]:
+    """The settings that differ, each with its dotted key and both values; keys that only one of them has are newer than the other."""
+    differ = []
+    for name in sorted(registered.keys() & found.keys()):
+        then, now = registered[name], found[name]
+        if isinstance(then, dict) and isinstance(now, dict):
+            differ += settings_differences(then, now, f"{above}{name}.")
+        elif then != now:
+            differ.append(f"{above}{name} {now!r:.40} instead of {then!r:.40}")
+    return differ
+
+
 def read_registration(folder: FilePath) -> Registration | None:
     """The registration in the folder of a set of results; None without one.
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from advnerf_core.report.evidence.registration import (
     FILE,
@@ -12,6 +11,7 @@ from advnerf_core.report.evidence.registration import (
     Registration,
     launch_file,
     read_registration,
+    settings_differences,
 )
 from nodes.experiment.engine.artefact import PUBLISHED, Settings
 from nodes.experiment.engine.run_folder import CELLS
@@ -72,25 +72,13 @@ def not_registered(experiment: Experiment, cells: Sequence[Cell]) -> str:
     if not outside:
         return ""
     scenario = registration.scenario(outside[0].scenario)
-    then = {} if scenario is None else scenario.settings
-    differ = _differences(then, registered_settings(experiment.of(outside[0])).resolved) if then else []
+    now = registered_settings(experiment.of(outside[0])).resolved
+    differ = [] if scenario is None else settings_differences(scenario.settings, now)
     why = f": {', '.join(differ[:_MOST_DIFFERENCES])}" if differ else ""
     return (
         f"{len(outside)} cells are not run under the registration {PUBLISHED / registration.name / FILE}, and cannot be published in its set, as their "
         f"settings differ{why}"
     )
-
-
-def _differences(then: Mapping[str, Any], now: Mapping[str, Any], above: str = "") -> list[str]:
-    """The keys in which settings differ, dotted, with both values."""
-    found = []
-    for name in sorted(then.keys() | now.keys()):
-        before, after = then.get(name), now.get(name)
-        if isinstance(before, dict) and isinstance(after, dict):
-            found += _differences(before, after, f"{above}{name}.")
-        elif before != after:
-            found.append(f"{above}{name} {after!r:.40} instead of {before!r:.40}")
-    return found
 
 
 def registered_cell(cell: Cell) -> RegisteredCell:

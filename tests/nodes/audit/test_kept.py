@@ -67,6 +67,7 @@ def folder(tmp_path):
     result = audit_result(
         verdict={"outcome": "found", "evidence": "world", "sentence": sentence, "reasons": []},
         place={**audit()["place"], "off_track_m": LIMIT_M},
+        starts={**audit()["starts"], "judging": {"seed": 2, "count": STARTS}},
         strongest={**audit()["strongest"], "judgements": [judged(*each) for each in found.items()]},
         controls=[
             control for name, each in found.items() for control in controls_of(name, each.arms, LIMIT_M)
@@ -118,6 +119,7 @@ def shifted(data):
         ),
         (lambda data: data["strongest"]["judgements"][0].update(disturbed=None), "surrogate: disturbed"),
         (lambda data: data["place"].update(off_track_m=1.0), r"place\.off_track_m"),
+        (lambda data: data["starts"]["judging"].update(count=80), r"starts\.judging\.count"),
         (lambda data: data["strongest"]["judgements"].pop(0), "judged evidence"),
         (lambda data: data["verdict"].update(outcome="nothing_found"), "verdict: expected found"),
         (lambda data: data["verdict"].update(sentence="It moves by 0.01 m."), r"verdict\.sentence"),

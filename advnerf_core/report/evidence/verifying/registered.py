@@ -7,6 +7,7 @@ from datetime import datetime
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
+from advnerf_core.report.evidence.registration import settings_differences
 from advnerf_core.report.evidence.results import Evidence
 
 
@@ -53,6 +54,10 @@ def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
     for key, value in wanted.items():
         if (found := cell.extra.get(key, value)) != value:  # an older cell has no such note
             yield f"{cell.name}: expected {key} {value} as registered, got {found}"
+    if bool(scenario.settings) > bool(cell.settings):
+        yield f"{cell.name}: expected its settings, as the registration has them, got none"
+    for text in settings_differences(scenario.settings, cell.settings):
+        yield f"{cell.name}: expected the registered settings, got {text}"
     clip = str(cell.extra.get("clip") or cell.name)
     if not clip.startswith(cell.name):
         yield f"{cell.name}: names the clip of another cell, {clip}"
