@@ -22,6 +22,7 @@ from nodes.experiment.plan.cell import Cell, cells_of
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.experiment_file import read_experiment_file
 from nodes.experiment.plan.over import OVER
+from nodes.experiment.plan.victims import RETRAINED
 from nodes.lab.located import READ_AGAIN
 from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
@@ -156,7 +157,7 @@ class RunFolder:
 
 
 def _check_cells(made: RunFolder, document: Document) -> None:
-    """Check that cells have different names, and that contrasts and claims name existing cells."""
+    """Check that cells have different names, paths and victims that exist, and that contrasts and claims name existing cells."""
     (name, count), *_ = Counter(cell.name for cell in made.cells).most_common(1)
     if count > 1:
         raise ConfigError(
@@ -169,6 +170,13 @@ def _check_cells(made: RunFolder, document: Document) -> None:
             message = unknown(name, what, names)
             raise ConfigError(f"{document.place(place)}: {'.'.join(map(str, place))}: {message}")
 
+    for variant, config in made.variants.items() or (("", made.config),):
+        within = f" in {variant}" if variant else ""
+        victims = (*config.attacked, *((RETRAINED,) if config.retrain else ()))
+        for victim in config.over.victim or ():
+            require(victim, f"victim{within}", victims, OVER, "victim")
+        for path in config.over.path or ():
+            require(path, f"path{within}", config.paths, OVER, "path")
     for index, contrast in enumerate(made.config.contrasts):
         for name in (contrast.before, contrast.after):
             require(name, "variant", known, "contrasts", index)

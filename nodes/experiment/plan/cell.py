@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from advnerf_core.plugins import name_in_results
+from advnerf_core.plugins import name_in_results, unknown
 from advnerf_core.report.cells import cell_name
 from advnerf_core.report.conditions import CONTROLS, NONE
 from nodes.experiment.plan.config import ExperimentConfig
@@ -108,7 +108,7 @@ def select(cells: Sequence[Cell], only: str) -> list[Cell]:
     """The cells that match a text such as ``path=straight,method=gradient+none,seed=0``; an empty text selects all.
 
     Raises:
-        ConfigError: The text is invalid, or no cell matches.
+        ConfigError: The text is invalid, a value is that of no cell, or no cell matches.
     """
     wanted: dict[str, set[str]] = {}
     for part in filter(None, only.split(",")):
@@ -117,11 +117,12 @@ def select(cells: Sequence[Cell], only: str) -> list[Cell]:
             raise ConfigError(
                 f"--only {only}: expected KEY=VALUE with KEY one of {', '.join(KEYS)}, got {part!r}"
             )
-        if key.strip() in wanted:
-            raise ConfigError(
-                f"--only {only}: expected {key.strip()} once, got it twice; join its values with +"
-            )
-        wanted[key.strip()] = {each.strip() for each in value.split("+")}
+        if (name := key.strip()) in wanted:
+            raise ConfigError(f"--only {only}: expected {name} once, got it twice; join its values with +")
+        wanted[name] = {each.strip() for each in value.split("+")}
+        known = dict.fromkeys(str(getattr(cell, name)) for cell in cells)
+        for each in sorted(wanted[name] - known.keys()):
+            raise ConfigError(f"--only {only}: {unknown(each, name, known)}")
     chosen = [
         cell for cell in cells if all(str(getattr(cell, key)) in values for key, values in wanted.items())
     ]

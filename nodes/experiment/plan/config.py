@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, ValidationInfo, field_validator, mod
 
 from advnerf_core.plugins import name_in_results
 from advnerf_core.report.conditions import CONTROLS, EMPTY
+from advnerf_core.report.evidence.kept_build import BUILD
 from advnerf_core.report.evidence.registration import Contrast, PlaceClaim
 from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
@@ -41,6 +42,7 @@ from nodes.experiment.plan.victims import (
 )
 
 SCENE, POLICY = "scene", "policy"
+_LONGEST_NAME = 100  # names of temporary files and of pictures beside a set are longer
 
 
 def _name_of_a_folder(name: str) -> str:
@@ -48,6 +50,10 @@ def _name_of_a_folder(name: str) -> str:
     if "/" in name or "\0" in name or name in (".", ".."):
         raise ValueError(
             "expected a name without /, as it becomes that of a folder; --folder says where results go"
+        )
+    if name == BUILD or name != name.strip() or not name.isprintable() or len(name.encode()) > _LONGEST_NAME:
+        raise ValueError(
+            f"expected printed characters, none of them a space at an end, at most {_LONGEST_NAME} bytes, and not {BUILD}, where published stages lie"
         )
     return name
 

@@ -41,7 +41,7 @@ class CaptureConfig(StrictModel):
         default=36.0,
         description="Views of the driving camera lie so far along each path that does not close [m].",
     )
-    seed: int = 0
+    seed: Count = 0
 
 
 class SceneConfig(StrictModel):
@@ -82,7 +82,7 @@ class SceneConfig(StrictModel):
         default=False,
         description="Learn a gain per channel for each photograph; for worlds whose camera chooses its exposure.",
     )
-    seed: int = 0
+    seed: Count = 0
     bake_unbounded: bool = Field(
         default=False,
         description="Bake the scene too if it extends outside its box, so that searches in it are faster.",
@@ -180,7 +180,7 @@ class PolicyConfig(StrictModel):
         description="Random textures that it sees, each of one of these families; baselines are then searches of other ones. patterns are stripes, checks and "
         "areas of one colour, which no search draws.",
     )
-    seed: int = 0
+    seed: Count = 0
 
     @model_validator(mode="after")
     def _fits_the_architecture(self) -> PolicyConfig:
@@ -234,7 +234,7 @@ class MeasureConfig(StrictModel):
     """Starts from which finished attacks are measured, in both domains: the same for all methods and seeds."""
 
     starts: Positive = Field(default=5, description="Starts, none of which a search had.")
-    seed: int = Field(default=10_000, description="Of the starts.")
+    seed: Count = Field(default=10_000, description="Of the starts.")
     scene: Literal["field", "baked"] = Field(
         default="field",
         description="The learned scene of the drives: the field itself, or the baked one that searches use, several times as fast.",
@@ -352,4 +352,4 @@ class RetrainConfig(StrictModel):
     new_share: Annotated[float, Field(gt=0, lt=1)] = Field(
         default=0.4, description="Share of new frames in the training."
     )
-    seed: int = 0
+    seed: Count = 0

@@ -14,7 +14,7 @@ from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]
-JUNCTION = ROOT / "launch" / "junction.experiment.yaml"
+JUNCTION, ROOM = (ROOT / "launch" / f"{name}.experiment.yaml" for name in ("junction", "room"))
 FILE = f"""base: {JUNCTION}
 setting: full
 name: mine
@@ -25,7 +25,7 @@ over:
       run_folder: runs/near
       world.car.turn_rate_lag_s: 0.5
     places: {{space.kind: places, over.seed: [7]}}
-    room: {{base: {ROOT / "launch" / "room.experiment.yaml"}, setting: panel, deploy.car: ideal}}
+    room: {{base: {ROOM}, setting: panel, deploy.car: ideal, policy: {{naive_steps: 9, own_car: false}}}}
   victim: [hardened, naive]
   method: [none, gradient]
   seed: [0, 1]
@@ -130,6 +130,35 @@ def test_a_claim_is_about_cells_that_are_there(file, change, told):
         load(file, said({**claim, key: value}))
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            "over.victim=[hardened, hardend]",
+            r"over.victim: expected a victim in near of hardened, .*; got 'hardend'",
+        ),
+        ("over.path=[straigt]", r"over.path: expected a path in near of straight, .*; got 'straigt'"),
+        ("over.variant.near={over.path: [track]}", r"over.path: expected a path in near of .*; got 'track'"),
+        (
+            "over.variant.room.policy.naive_steps=0",
+            r"over.victim: expected a victim in room of hardened; got 'naive'",
+        ),
+        ("measure.seed=-1", "measure.seed: .* greater than or equal to 0, got -1"),
+    ],
+)
+def test_cells_are_of_victims_and_paths_that_exist(file, change, told):
+    """They would be registered, and fail after hours of learning."""
+    with pytest.raises(ConfigError, match=told):
+        load(file, change)
+
+
+def test_a_retrained_victim_exists_where_one_is_retrained(file):
+    made = load_experiment(JUNCTION, "retrain", ["over.victim=[retrained]"], None)
+    assert {cell.victim for cell in made.cells} == {"retrained"}
+    with pytest.raises(ConfigError, match="expected a victim of hardened, naive; got 'retrained'"):
+        load_experiment(JUNCTION, "full", ["over.victim=[retrained]"], None)
+
+
 def test_overrides_hold_for_all_variants(file):
     loaded = load(file, "attack.evaluations=9", "over.seed=[4]")
     assert {each.attack.evaluations for each in loaded.variants.values()} == {9}
@@ -145,10 +174,15 @@ def test_cells_are_selected_by_what_they_are(file):
         ConfigError, match="expected KEY=VALUE with KEY one of variant, path, victim, method, seed"
     ):
         select(cells, "mode=random")
-    with pytest.raises(ConfigError, match="got none"):
-        select(cells, "variant=monitor")
-    with pytest.raises(ConfigError, match=r"expected path once, got it twice; join its values with \+"):
-        select(cells, "path=left,path=right")
+    with pytest.raises(ConfigError, match="expected some cells, got none"):
+        select(cells, "variant=near,path=left")
+    for only, told in (
+        ("variant=monitor", "expected a variant of near, places, room; got 'monitor'"),
+        ("variant=near,seed=0+9", "expected a seed of 0, 1, 7; got '9'"),
+        ("method=gradient,method=none", r"expected method once, got it twice; join its values with \+"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            select(cells, only)
 
 
 @pytest.mark.parametrize(
