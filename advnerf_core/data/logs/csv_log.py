@@ -16,7 +16,7 @@ from advnerf_core.csv_rows import CsvRow, read_csv
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.logs.choice import LogChoice, LogError
-from advnerf_core.data.logs.drive_log import DriveLog, LogFrame, SteeringUnit
+from advnerf_core.data.logs.drive_log import DriveLog, LogFrame, SteeringUnit, refuse_repeated_images
 from advnerf_core.documents import raise_problems
 from advnerf_core.errors import ConfigError
 
@@ -58,6 +58,7 @@ def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
             problems.append(str(error))
     raise_problems(problems)
     files = [_image_file(row, path.parent, images) for row in rows]
+    refuse_repeated_images(zip((row.place for row in rows), files, strict=True))
 
     def frames() -> Iterator[LogFrame]:
         for number, (row, file, value) in enumerate(zip(rows, files, values, strict=True)):

@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.logs.choice import LogChoice, LogError
-from advnerf_core.data.logs.drive_log import DriveLog, LogFrame, SteeringUnit, chosen_name, median_rate_hz
+from advnerf_core.data.logs.drive_log import (
+    DriveLog,
+    LogFrame,
+    SteeringUnit,
+    chosen_name,
+    median_rate_hz,
+    refuse_repeated_images,
+)
 from advnerf_core.documents import raise_problems, read_json, read_json_lines
 
 MANIFEST = "manifest.json"
@@ -72,6 +79,7 @@ def read_tub(path: Path, choice: LogChoice) -> DriveLog:
     name = _STEERING if choice.steering is None else chosen_name(choice.steering, controls, "steering", path)
     left_out |= {_PILOT: len(records) - len(driven)} if len(driven) < len(records) else {}
     values = _values(driven, name, images)
+    refuse_repeated_images((each.place, each.folder / each.values[images]) for each in driven)
     times_s = [1e-3 * each.time_ms for each in driven]
 
     def frames() -> Iterator[LogFrame]:
@@ -125,6 +133,10 @@ def _version_2(path: Path) -> tuple[tuple[list[_Record], tuple[Path, ...]], dict
         if index in deleted:
             counts[_DELETED] += 1
             continue
+        if deleted and type(index) is not int:
+            raise LogError(
+                f"{place}: _index: expected a number, as records are deleted by theirs, got {index!r:.40}; correct it"
+            )
         if isinstance(index, int) and (earlier := first.setdefault(index, place)) != place:
             raise LogError(
                 f"{place}: _index: expected one that no record has, got {index}, which {earlier} has; images are named after it, so that this one's "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -163,6 +163,20 @@ class DriveLog:
         for frame in self.frames():
             return frame.image
         raise LogError(f"expected images in {self.path}, got none; record more")
+
+
+def refuse_repeated_images(images: Iterable[tuple[str, Path]]) -> None:
+    """Refuse a log with an image twice: one of the two has the steering of another, and one would be learned where the other is held out.
+
+    Args:
+        images: Place for messages and image file of each frame.
+    """
+    first: dict[Path, str] = {}
+    for place, file in images:
+        if (earlier := first.setdefault(file, place)) != place:
+            raise LogError(
+                f"{place}: expected an image that nothing else has, got {file}, which {earlier} has; remove one of them"
+            )
 
 
 def median_rate_hz(times_s: Sequence[float]) -> float:

@@ -187,6 +187,9 @@ DAMAGED = {
     "a missing video": ("lerobot 2", lambda f: (f / f"videos/chunk-000/{CAMERA}/episode_000001.mp4").unlink(), r"episode_000001\.mp4: No such file"),
     "a description that was cut": ("lerobot 2", lambda f: cut(f / "meta/info.json"), r"info\.json:1: expected valid JSON"),
     "another version": ("lerobot 2", lambda f: (f / "meta/info.json").write_text('{"codebase_version": "v1.6", "features": {}}'), "expected codebase_version v2 or v3, got v1.6"),
+    "an image in two records": ("tub 2", lambda f: edit(f / "catalog_1.catalog", {"cam/image_array": "3_cam_image_array_.jpg"}), r"catalog_1\.catalog:5: expected an image that nothing else has, got \S*3_cam_image_array_\.jpg, which \S*catalog_0\.catalog:4 has"),
+    "a row twice": ("udacity", lambda f: (f / "driving_log.csv").write_text((f / "driving_log.csv").read_text() + (f / "driving_log.csv").read_text().split("\n")[1]), r"driving_log\.csv:14: expected an image that nothing else has, got .* which \S*driving_log\.csv:2 has"),
+    "an index as text": ("tub 2", lambda f: (edit(f / "catalog_1.catalog", {"_index": "9"}), edit(f / "manifest.json", {"deleted_indexes": [9]})), r"catalog_1\.catalog:5: _index: expected a number, as records are deleted by theirs, got '9'"),
     "missing episodes": ("lerobot 3", lambda f: (f / "meta/episodes/chunk-000/file-000.parquet").unlink(), "expected episode 0, found none"),
 }  # fmt: skip
 
