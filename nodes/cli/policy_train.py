@@ -245,7 +245,7 @@ def evaluate(
     written = []
     for each, folder in zip(opened, folders, strict=True):
         found = recorded_frames(each, loaded.view, expert)
-        predicted = measure.predict(loaded.policy, found.frames.images, goals)
+        predicted = measure.predict(loaded.policy, found.frames.images, goals, found.drive_starts())
         for name, errors in measure.compared(found, predicted, labels, held_out).items():
             rows.add_row(each.name, name, *_error_cells(errors))
         folder.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,32 +86,69 @@ def compared(
     return found
 
 
-def predict(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float64]:
-    """Compute the steering ``[N]`` [rad] of a loaded policy for policy images ``[N, H, W, 3]`` uint8."""
-    parts, batch = [], _BATCH
-    if not getattr(policy, "stateless", True):  # in driving order, one by one
-        policy, batch = Remembering.afresh(policy, 1), 1
+def predict(
+    policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = (), drive_starts: Sequence[int] = (0,)
+) -> NDArray[np.float64]:
+    """Compute the steering ``[N]`` [rad] of a loaded policy for policy images ``[N, H, W, 3]`` uint8.
+
+    Args:
+        drive_starts: Numbers of the images before which a policy with memory has none.
+
+    Raises:
+        ConfigError: The policy answers an image by no finite number.
+    """
+    has_memory = not getattr(policy, "stateless", True)
+    parts, batch, current = (
+        [],
+        1 if has_memory else _BATCH,
+        policy,
+    )  # with memory in driving order, one by one
     with torch.no_grad():
         for start in range(0, len(images), batch):
-            parts.append(_steer(policy, _tensor(images[start : start + batch]), goal).double().numpy())
-    return np.concatenate(parts)
+            if has_memory and (not start or start in drive_starts):
+                current = Remembering.afresh(policy, 1)
+            parts.append(_steer(current, _tensor(images[start : start + batch]), goal).double().numpy())
+    predicted_rad = np.concatenate(parts)
+    if len(wrong := np.flatnonzero(~np.isfinite(predicted_rad))):
+        raise ConfigError(
+            f"expected finite steering from the policy, got {predicted_rad[wrong[0]]} for {len(wrong)} of {len(images)} images, "
+            f"the first of them number {wrong[0]}; look for a division by zero or a logarithm, and for damaged weights"
+        )
+    return predicted_rad
 
 
 def saliency(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float32]:
     """Compute the saliency ``[N, H, W]`` in 0..1: absolute gradient of the steering, summed over colours, smoothed.
 
-    A policy with memory sees each image as the first of a drive.
+    A policy with memory sees each image as the first of a drive. Without a finite gradient, a `ConfigError` is raised.
 
     Gradient saliency after Simonyan et al., "Deep Inside Convolutional Networks", 2014, with a blur of 1.5 px.
     """
     maps = []
     for start in range(0, len(images), _BATCH):
         batch = _tensor(images[start : start + _BATCH]).requires_grad_(True)
-        (gradient,) = torch.autograd.grad(_steer(policy, batch, goal).sum(), batch)
-        for one in gradient.abs().sum(1).numpy():
+        for one in _gradient(policy, batch, goal).abs().sum(1).numpy():
             smooth = cv2.GaussianBlur(one, (0, 0), 1.5)
             maps.append(smooth / max(float(smooth.max()), 1e-12))
     return np.stack(maps).astype(np.float32)
+
+
+def _gradient(policy: Any, images: torch.Tensor, goal: tuple[float, ...]) -> torch.Tensor:
+    """Gradient of the steering in the images, ``[B, 3, H, W]``."""
+    steering = _steer(policy, images, goal)
+    if not steering.requires_grad:
+        raise _no_saliency("none: something cuts it off, such as detach, no_grad or rounding")
+    gradient = torch.autograd.grad(steering.sum(), images)[0]
+    if not bool(gradient.isfinite().all()):
+        raise _no_saliency("one that is NaN or infinite")
+    return gradient
+
+
+def _no_saliency(got: str) -> ConfigError:
+    return ConfigError(
+        f"expected a gradient of the steering in the images, got {got}; correct the policy (see advnerf policy check), "
+        "or give --saliency 0 without --video"
+    )
 
 
 def overlay(image: NDArray[np.uint8], share: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -129,15 +167,13 @@ def draw(recording: RecordedFrames, predicted_rad: NDArray[np.float64], title: s
     figure = Figure(figsize=(10, 4), layout="constrained")
     axes, scatter = figure.subplots(1, 2, width_ratios=[2, 1])
     time_s = (recording.stamps_ns - recording.stamps_ns[0]) / NS_PER_S
-    if recording.stamps_ns[0] == 0:
+    if not recording.has_times:
         time_s = recording.stamps_ns.astype(float)
     labels = np.asarray(recording.frames.steering_rad)
     axes.plot(time_s, recording.recorded_rad, color="0.6", lw=1, label="recorded")
     axes.plot(time_s, labels, color="C0", lw=1, label="label")
     axes.plot(time_s, predicted_rad, color="C3", lw=1, label="predicted")
-    axes.set(
-        xlabel="frame" if recording.stamps_ns[0] == 0 else "time [s]", ylabel="steering, left positive [rad]"
-    )
+    axes.set(xlabel="time [s]" if recording.has_times else "frame", ylabel="steering, left positive [rad]")
     axes.set_title(title, fontsize=9)
     axes.legend(fontsize=8)
     scatter.plot(labels, predicted_rad, ".", ms=2, color="C3")

@@ -14,16 +14,18 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.data.logs.choice import LogError
-from advnerf_core.data.logs.drive_log import DriveLog, Labels, LogFrame
+from advnerf_core.data.logs.drive_log import FASTEST_HZ, DriveLog, Labels, LogFrame
 from advnerf_core.driving.expert import Expert
 from advnerf_core.geometry import Pinhole
 from advnerf_core.learning.frames import Frames, FrameSet
 from advnerf_core.policies.view import PolicyView
+from nodes.runtime.clock import NS_PER_S
 
 LEAST_FRAMES = 4
 # Logs are short: of every five blocks of frames, one is kept for validation.
 HOLDOUT_EVERY = 5
 _GIVE_UP_M = 0.7
+_NEW_DRIVE_S = 1.0  # the live node forgets after such a pause, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,18 @@ class RecordedFrames:
     recorded_rad: np.ndarray[Any, np.dtype[np.float64]]
     name: str
     counts: dict[str, int]
+
+    @property
+    def has_times(self) -> bool:
+        """Whether the stamps are times: row numbers would be nanoseconds."""
+        steps_ns = np.abs(np.diff(self.stamps_ns))
+        return bool(len(steps_ns)) and float(np.median(steps_ns)) * FASTEST_HZ >= NS_PER_S
+
+    def drive_starts(self) -> list[int]:
+        """Numbers of the frames before which the log pauses or goes back, with the first: there a policy has no memory."""
+        steps_s = np.abs(np.diff(self.stamps_ns)) / NS_PER_S
+        pauses = np.flatnonzero(steps_s > _NEW_DRIVE_S) + 1 if self.has_times else ()
+        return [0, *map(int, pauses)]
 
 
 def frames_of(log: DriveLog, view: PolicyView, expert: Expert | None, labels: Labels) -> RecordedFrames:

@@ -176,7 +176,32 @@ def test_a_policy_of_several_images_is_compared_in_the_order_of_the_recording():
     greys = np.array([51, 102, 255, 204], np.uint8)
     images = np.broadcast_to(greys[:, None, None, None], (4, 66, 200, 3))
     assert predict(Slower(), images).tolist() == pytest.approx([0.2, 0.2, 0.6, -0.2], abs=1e-6)
+    # Where another drive begins, there is no memory.
+    assert predict(Slower(), images, (), [0, 2]).tolist() == pytest.approx([0.2, 0.2, 1.0, -0.2], abs=1e-6)
     assert saliency(Slower(), images).shape == (4, 66, 200)
+
+
+def test_answers_that_are_no_numbers_are_not_left_out_of_the_errors():
+    greys = np.array([10, 200, 10, 250], np.uint8)
+    images = np.broadcast_to(greys[:, None, None, None], (4, 66, 200, 3))
+    with pytest.raises(
+        ConfigError, match=r"finite steering from the policy, got nan for 2 of 4 images, .* number 1;"
+    ):
+        predict(lambda images, goals: (0.5 - images.mean((1, 2, 3))).sqrt(), images)
+
+
+@pytest.mark.parametrize(
+    ("steer", "got"),
+    [
+        (lambda images: images.detach().mean((1, 2, 3)), "none: something cuts it off"),
+        (lambda images: (0.0 * images.mean((1, 2, 3))).sqrt(), "one that is NaN or infinite"),
+    ],
+)
+def test_a_map_without_a_gradient_is_refused(steer, got):
+    with pytest.raises(
+        ConfigError, match=f"a gradient of the steering in the images, got {got}.* --saliency 0"
+    ):
+        saliency(lambda images, goals: steer(images), np.zeros((2, 66, 200, 3), np.uint8))
 
 
 def test_training_learns_is_kept_and_begins_anew_for_other_recordings(tmp_path, monkeypatch):
