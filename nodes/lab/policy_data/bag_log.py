@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import islice
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from advnerf_core.data.logs.choice import LogChoice, LogError
 from advnerf_core.data.logs.drive_log import (
@@ -32,6 +34,7 @@ from nodes.bags.info import BagInfo, BagMessage
 from nodes.bags.reader import read_attachments, read_info, read_messages
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import MessageError
 from nodes.runtime.image_parts import IMAGE_TYPE
 from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
 from nodes.runtime.pictures import COMPRESSED_TYPE, rgb_image
@@ -101,7 +104,9 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
     steering = _steering_topic(choice.steering, controls, bag)
     joined = [name for name in (CAR_TOPIC, _SAFETY, _EXPERT) if name in counts]
     kinds = {images: IMAGE_TYPE, **({steering: _steering_type(steering)} if steering else {})}
-    unstamped = _unstamped(bag, kinds)
+    others = [name for name in cameras if name != images]
+    with _naming(others):
+        unstamped = _unstamped(bag, kinds)
     time_ns = _recorded_ns if unstamped else _stamped_ns
     track = cache(partial(_read_track, bag, steering, joined, time_ns))
     return DriveLog(
@@ -116,7 +121,7 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
         _rate_hz(bag, images),
         counts.get(CAR_TOPIC, 0),
         lambda: np.array([each[1] for each in track().sent], np.float64),
-        lambda: _frames(bag, images, track(), time_ns),
+        lambda: _frames(bag, images, others, track(), time_ns),
         labels="expert" if counts.get(CAR_TOPIC) else "recorded",
         attached=lambda: read_attachments(bag) if info.attachments else {},
         unchecked=info.unchecked,
@@ -124,6 +129,17 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
         if unstamped
         else "",
     )
+
+
+@contextmanager
+def _naming(others: Sequence[str]) -> Iterator[None]:
+    """Name the other images of a bag if the chosen ones, such as depths, cannot be shown: ``log info`` would list them."""
+    try:
+        yield
+    except MessageError as error:
+        if not others:
+            raise
+        raise LogError(f"{error}; or choose other images with --images: {', '.join(others)}") from error
 
 
 def _rate_hz(bag: Path, images: str) -> float:
@@ -184,15 +200,16 @@ def _refuse_going_back(latest_ns: dict[str, int], topic: str, stamp_ns: int, pla
         )
 
 
-def _frames(bag: Path, images: str, track: _Track, time_ns: _Time) -> Iterator[LogFrame]:
+def _frames(
+    bag: Path, images: str, others: Sequence[str], track: _Track, time_ns: _Time
+) -> Iterator[LogFrame]:
     latest_ns: dict[str, int] = {}
-    for number, message in enumerate(read_messages(bag, [images], types={images: IMAGE_TYPE})):
-        image = decode(IMAGE_TYPE, message.cdr)
-        stamp_ns, place = time_ns(message, image), f"{bag}, image {number}"
+    for number, (stamp_ns, rgb) in enumerate(_pictures(bag, images, others, time_ns)):
+        place = f"{bag}, image {number}"
         _refuse_going_back(latest_ns, images, stamp_ns, place)
         steering_rad, speed_mps = track.command(stamp_ns)
         yield LogFrame(
-            rgb_image(image, f"{images} in {bag}"),
+            rgb,
             stamp_ns,
             steering_rad,
             place,
@@ -201,6 +218,16 @@ def _frames(bag: Path, images: str, track: _Track, time_ns: _Time) -> Iterator[L
             "" if track.is_armed(stamp_ns) else "not armed",
             track.is_disturbed(stamp_ns),
         )
+
+
+def _pictures(
+    bag: Path, images: str, others: Sequence[str], time_ns: _Time
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Time [ns] and RGB ``[H, W, 3]`` of each image."""
+    with _naming(others):
+        for message in read_messages(bag, [images], types={images: IMAGE_TYPE}):
+            image = decode(IMAGE_TYPE, message.cdr)
+            yield time_ns(message, image), rgb_image(image, f"{images} in {bag}")
 
 
 def _read_track(bag: Path, steering: str | None, topics: list[str], time_ns: _Time) -> _Track:

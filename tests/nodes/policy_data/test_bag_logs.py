@@ -105,7 +105,15 @@ def test_an_export_has_an_episode_for_each_drive_and_never_replaces_one(tmp_path
 
 
 def write_ackermann(
-    path, form, topics=("/drive",), unstamped=(), late_ns=1000, step=0.02, count=6, going_back=()
+    path,
+    form,
+    topics=("/drive",),
+    unstamped=(),
+    late_ns=1000,
+    step=0.02,
+    count=6,
+    going_back=(),
+    depths=(),
 ):
     """A bag of other software: images, and commands of a car.
 
@@ -114,6 +122,7 @@ def write_ackermann(
         late_ns: From an image to the recording of its command, and, in another clock, to its stamp [ns].
         step: Steering of an image above that of the one before.
         going_back: Topics whose clock jumps 2 s back before the fourth image.
+        depths: Topics with images of depths.
     """
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
@@ -130,6 +139,7 @@ def write_ackermann(
         )
     with writer:
         images = writer.add_connection("/front/image", IMAGE, typestore=store)
+        depth_images = [writer.add_connection(topic, IMAGE, typestore=store) for topic in depths]
         drives = [writer.add_connection(topic, ACKERMANN, typestore=store) for topic in topics]
         for k in range(count):
             image = make.image(k)
@@ -138,6 +148,9 @@ def write_ackermann(
                 image.header.stamp.sec = image.header.stamp.nanosec = 0
             image.header.stamp.sec -= 2 if k >= 3 and "/front/image" in going_back else 0
             writer.write(images, t, pack(image, IMAGE))
+            image.encoding = "32FC1"
+            for depth in depth_images:
+                writer.write(depth, t, pack(image, IMAGE))
             for topic, drive in zip(topics, drives, strict=True):
                 command = store.types[DRIVE](step * k, 0.0, 1.5, 0.0, 0.0)
                 message = store.types[ACKERMANN](header=make.header(k, "car"), drive=command)
@@ -208,6 +221,15 @@ def test_of_two_topics_with_commands_none_is_taken_unasked(tmp_path):
     assert open_log(bag, LogChoice(steering="/b")).unit.name == "/b"
     with pytest.raises(LogError, match=r"expected a topic with wheel angles /c in .*, it has /a, /b"):
         open_log(bag, LogChoice(steering="/c"))
+
+
+def test_images_that_cannot_be_shown_are_answered_with_the_others(tmp_path):
+    bag = write_ackermann(tmp_path / "drive", "ros2", depths=("/aligned_depth/image",))
+    log = open_log(bag)
+    said = r"expected a supported image encoding, got '32FC1'.*; or choose other images with --images: /front/image"
+    with pytest.raises(LogError, match=said):
+        log.first_image()
+    assert len(list(open_log(bag, LogChoice(images="/front/image")).frames())) == 6
 
 
 def test_a_damaged_bag_is_one_line(tmp_path, monkeypatch, capsys):
