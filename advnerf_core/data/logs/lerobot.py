@@ -35,6 +35,9 @@ STAMP, DISTURBED = "stamp_ns", "disturbed"
 _ACTION, _STATE = "action", "observation.state"
 _VERSIONS = ("v2", "v3")
 _BATCH = 64
+# Episodes have no times of their own: a pause between them keeps them apart.
+_PAUSE_S = 10.0
+_RATE_TOLERANCE = 0.1
 _LARGEST = 2**53
 # Exceptions that PyArrow raises for a damaged file beside its own.
 _NONSENSE = (OSError, ValueError, KeyError, IndexError, TypeError, OverflowError, MemoryError)
@@ -64,13 +67,22 @@ class _DataSet:
         names = description.get("names")
         if isinstance(names, dict):
             names = next(iter(names.values()), None)
-        shape = description.get("shape") or [1]
-        size = shape[0] if len(shape) == 1 and isinstance(shape[0], int) else 0
+        shape = self.shape(feature)
+        size = shape[0] if len(shape) == 1 else 0
         return (
             list(map(str, names))
             if isinstance(names, list) and len(names) == size
             else [*map(str, range(size))]
         )
+
+    def shape(self, feature: str) -> list[int]:
+        """Shape of a feature's numbers in one frame."""
+        shape = self.features[feature].get("shape") or [1]
+        if not isinstance(shape, list) or not all(type(each) is int and each > 0 for each in shape):
+            raise LogError(
+                f"{self.path / INFO}: features.{feature}.shape: expected a list such as [2], got {shape!r:.60}; copy the data set again"
+            )
+        return shape
 
     def rows(self, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """Columns ``[N, K]`` of all tables."""
@@ -107,12 +119,13 @@ def read_lerobot(path: Path, choice: LogChoice) -> DriveLog:
     columns += [name for name in (_ACTION, _STATE) if name in data.features]
     columns += [DISTURBED] if data.is_ours and DISTURBED in data.features else []
     table = data.rows(columns)
+    _require_consistent(data, table)
     count = len(table["timestamp"])
     values = _values(data, table, steering) if steering else np.full(count, math.nan)
     speed = f"{_ACTION}:{SPEED_NAME}"
     speeds = _values(data, table, speed) if data.is_ours and speed in controls else np.full(count, math.nan)
     states = table[state] if state else np.full((count, 3), math.nan)
-    stamps = _stamps(data, count)
+    stamps = _stamps(data, table["episode_index"][:, 0])
     disturbed = table[DISTURBED][:, 0] if DISTURBED in table else np.zeros(count)
 
     def frames() -> Iterator[LogFrame]:
@@ -161,7 +174,7 @@ def _described(path: Path) -> _DataSet:
             f"{path / INFO}: expected codebase_version {' or '.join(_VERSIONS)}, got {version}; convert the data set with lerobot"
         )
     fps = info.get("fps")
-    if not isinstance(fps, int | float) or not 0 < fps < 1e4:
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < 1e4:
         raise LogError(f"{path / INFO}: fps: expected images per second, got {fps!r}")
     found = _DataSet(path, version, float(fps), features, info)
     if not found.tables:
@@ -188,10 +201,44 @@ def _values(data: _DataSet, table: dict[str, NDArray[np.float64]], control: str)
     return table[feature][:, data.names(feature).index(name)]
 
 
-def _stamps(data: _DataSet, count: int) -> NDArray[np.int64]:
-    """Capture times [ns]. Numbers of nanoseconds since 1970 are no ``float64``, so they are read unchanged."""
+def _require_consistent(data: _DataSet, table: dict[str, NDArray[np.float64]]) -> None:
+    """Raise if the description and the tables contradict each other: images would be joined with the numbers of other frames."""
+    times_s, episodes = table["timestamp"][:, 0], table["episode_index"][:, 0]
+    total = data.info.get("total_frames")
+    if isinstance(total, int) and total != len(times_s):
+        raise LogError(
+            f"{data.path / INFO}: expected total_frames to be the rows of data/*/*.parquet, got {total} for {len(times_s)} rows; "
+            "a table is missing, damaged, or there twice: copy the data set again"
+        )
+    for feature in (_ACTION, _STATE):
+        width = table[feature].shape[1] if feature in table else 0
+        if width and math.prod(data.shape(feature)) != width:
+            raise LogError(
+                f"{data.path / INFO}: features.{feature}.shape: expected {width} numbers, as the tables have, got {data.shape(feature)}; "
+                "correct shape and names"
+            )
+    steps_s = np.diff(times_s)[np.diff(episodes) == 0]
+    if not (steps_s > 0.0).all():
+        raise LogError(
+            f"{data.path}: timestamp: expected times that go forward in each episode, got some that go back, repeat, or are none; "
+            "copy the data set again"
+        )
+    rate_hz = 1.0 / float(np.median(steps_s)) if len(steps_s) else data.fps
+    if abs(rate_hz / data.fps - 1.0) > _RATE_TOLERANCE:
+        raise LogError(
+            f"{data.path / INFO}: fps: expected {rate_hz:.4g}, as the column timestamp of the tables has, got {data.fps:g}; correct it"
+        )
+
+
+def _stamps(data: _DataSet, episodes: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Capture times [ns]. Numbers of nanoseconds since 1970 are no ``float64``, so they are read unchanged.
+
+    Args:
+        episodes: Episode ``[N]`` of each frame.
+    """
     if not (data.is_ours and STAMP in data.features):
-        return np.round(np.arange(count) * (1e9 / data.fps)).astype(np.int64)
+        pauses = np.cumsum(np.diff(episodes, prepend=episodes[:1]) != 0)
+        return np.round(1e9 * (np.arange(len(episodes)) / data.fps + _PAUSE_S * pauses)).astype(np.int64)
     values = [value for file in data.tables for value in read_table(file, [STAMP])[STAMP].to_pylist()]
     try:
         return np.array(values, np.int64)
@@ -353,4 +400,6 @@ def _numbers(file: Path, table: Any, name: str) -> NDArray[np.float64]:
         raise LogError(
             f"{file}: {name}: expected numbers in every row, got something else; copy the data set again"
         ) from error
+    if not len(found):
+        raise LogError(f"{file}: expected rows, got none; copy the data set again")
     return np.where(np.abs(found) < _LARGEST, found, math.nan).reshape(len(found), -1)

@@ -33,7 +33,8 @@ CAMERA = "observation.images.camera"
 _VERSION = "v3.0"
 _TASK = "drive"
 _FILE = "chunk-000/file-000"
-_GAP_FRAMES = 3.0  # a longer pause between two images starts another episode
+_GAP_FRAMES = 3.0  # a longer pause between two images starts another episode, as does a step back
+_RATE_TOLERANCE = 0.2
 _QUALITY = "5"  # x264's constant rate factor: errors of a level of 256, as rounding to YUV has
 _KEYFRAME_EVERY = "10"  # training reads frames in any order
 _LEAST_IMAGES = 4
@@ -72,11 +73,11 @@ def write_lerobot(
     Args:
         log: The log; the unit of its steering must be known.
         folder: New folder of the data set.
-        rate_hz: Images per second; None for the log's.
+        rate_hz: Images per second, about the log's if it has times; None for the log's.
         report: Called with the number of frames written.
 
     Raises:
-        LogError: The folder exists, or the log has too few frames, no steering, or no times.
+        LogError: The folder exists, or the log has too few frames, no steering, no times, or times of another rate.
     """
     if folder.exists():
         raise LogError(f"{folder} exists; remove it or choose another folder with --output")
@@ -84,7 +85,7 @@ def write_lerobot(
         raise LogError(
             f"expected steering in {log.path}, found none; name it with --steering, it has {', '.join(log.controls) or 'none'}"
         )
-    rate_hz = rate_hz or _rate_of(log)
+    rate_hz = _rate_of(log, rate_hz)
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     shutil.rmtree(partial, ignore_errors=True)
     try:
@@ -95,12 +96,22 @@ def write_lerobot(
     return done
 
 
-def _rate_of(log: DriveLog) -> int:
-    if not 0.5 <= log.rate_hz <= FASTEST_HZ:
+def _rate_of(log: DriveLog, asked_hz: int | None) -> int:
+    """Images per second. Each image is one frame of the video, so that another rate than the log's would change the speed of the drive."""
+    is_known = 0.5 <= log.rate_hz <= FASTEST_HZ
+    if asked_hz is None and not is_known:
         raise LogError(
             f"expected times of the images of 0.5 to {FASTEST_HZ:g} Hz in {log.path}, got {log.rate_in_words}; give the images per second with --rate"
         )
-    return round(log.rate_hz)
+    rate_hz = max(round(log.rate_hz), 1) if asked_hz is None else asked_hz
+    if is_known and abs(rate_hz - log.rate_hz) > max(1.0, _RATE_TOLERANCE * log.rate_hz):
+        raise LogError(
+            f"--rate: expected about {log.rate_hz:.3g}, the images per second of {log.path}, got {rate_hz}; leave it out: no images are left out "
+            "or repeated"
+        )
+    if rate_hz > FASTEST_HZ:
+        raise LogError(f"--rate: expected 1 to {FASTEST_HZ:g} images per second, got {rate_hz}; correct it")
+    return rate_hz
 
 
 def _write(log: DriveLog, folder: Path, rate_hz: int, report: Report) -> Exported:
@@ -142,7 +153,7 @@ def _write(log: DriveLog, folder: Path, rate_hz: int, report: Report) -> Exporte
 
 
 def _usable(log: DriveLog, rate_hz: int) -> Iterator[tuple[_Row, LogFrame]]:
-    """Frames with steering. A pause, or frames left out in between, start another episode."""
+    """Frames with steering. A pause, times that go back, or frames left out in between, start another episode."""
     assert log.unit is not None
     episode = number = -1
     last_ns: float = -math.inf
@@ -152,7 +163,7 @@ def _usable(log: DriveLog, rate_hz: int) -> Iterator[tuple[_Row, LogFrame]]:
         if frame.unusable or math.isnan(frame.steering):
             skipped = True
             continue
-        paused = timed and frame.stamp_ns - last_ns > _GAP_FRAMES * 1e9 / rate_hz
+        paused = timed and abs(frame.stamp_ns - last_ns) > _GAP_FRAMES * 1e9 / rate_hz
         if skipped or paused:
             episode, number, skipped = episode + 1, -1, False
         number, last_ns = number + 1, frame.stamp_ns

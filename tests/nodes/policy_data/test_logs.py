@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.data.logs.choice import LogChoice, LogError, LogRequest
+from advnerf_core.data.logs.lerobot_write import write_lerobot
 from advnerf_core.errors import AdvnerfError, ConfigError
 from nodes.lab.policy_data.frames import frames_of, view_for_size
 from nodes.lab.policy_data.log_facts import read_facts
@@ -66,7 +67,8 @@ def test_frames_have_their_image_their_steering_and_their_time(tmp_path, form):
     assert log.steering() == pytest.approx([value(k) for k in range(COUNT)], abs=1e-6)
     if form != "udacity":
         times_s = [1e-9 * (frame.stamp_ns - frames[0].stamp_ns) for frame in frames]
-        assert times_s == pytest.approx(np.arange(COUNT) / FPS)
+        pauses_s = 10.0 * (np.arange(COUNT) // 4) if "lerobot" in form else 0.0  # between episodes
+        assert times_s == pytest.approx(np.arange(COUNT) / FPS + pauses_s)
         assert log.rate_hz == pytest.approx(FPS)
 
 
@@ -164,6 +166,20 @@ def edit(file, values):
     file.write_text("\n".join([*before, json.dumps(json.loads(last) | values)]))
 
 
+def describe(folder, feature=None, **values):
+    """Replace values in the description of a data set, or of one of its features."""
+    info = json.loads((folder / "meta/info.json").read_text())
+    (info["features"][feature] if feature else info).update(values)
+    (folder / "meta/info.json").write_text(json.dumps(info))
+
+
+def change_table(folder, change):
+    """Change the table of a data set."""
+    pq = pytest.importorskip("pyarrow.parquet")
+    file = folder / "data/chunk-000/file-000.parquet"
+    pq.write_table(change(pq.read_table(file)), file)
+
+
 DAMAGED = {
     "a catalog that was cut": ("tub 2", lambda f: cut(f / "catalog_1.catalog"), r"catalog_1\.catalog:\d: expected valid JSON"),
     "a missing catalog": ("tub 2", lambda f: (f / "catalog_1.catalog").unlink(), r"catalog_1\.catalog: expected a file, found none"),
@@ -187,6 +203,14 @@ DAMAGED = {
     "a missing video": ("lerobot 2", lambda f: (f / f"videos/chunk-000/{CAMERA}/episode_000001.mp4").unlink(), r"episode_000001\.mp4: No such file"),
     "a description that was cut": ("lerobot 2", lambda f: cut(f / "meta/info.json"), r"info\.json:1: expected valid JSON"),
     "another version": ("lerobot 2", lambda f: (f / "meta/info.json").write_text('{"codebase_version": "v1.6", "features": {}}'), "expected codebase_version v2 or v3, got v1.6"),
+    "a description of slower images": ("lerobot 3", lambda f: describe(f, fps=1), r"info\.json: fps: expected 10, as the column timestamp .*, got 1; correct it"),
+    "a description of faster images": ("lerobot images", lambda f: describe(f, fps=30), r"info\.json: fps: expected 10, as"),
+    "a rate that is no number": ("lerobot 2", lambda f: describe(f, fps=True), r"info\.json: fps: expected images per second, got True"),
+    "a table that was not copied": ("lerobot 2", lambda f: (describe(f, total_frames=12), (f / "data/chunk-000/episode_000001.parquet").unlink()), r"total_frames .*, got 12 for 8 rows; a table is missing"),
+    "times that repeat": ("lerobot 3", lambda f: change_table(f, lambda rows: rows.take([0, *range(11)])), "timestamp: expected times that go forward in each episode"),
+    "names of more numbers": ("lerobot 3", lambda f: describe(f, "action", shape=[3], names=["a", "b", "steering"]), r"features\.action\.shape: expected 2 numbers, as the tables have, got \[3\]"),
+    "a shape that is no list": ("lerobot 3", lambda f: describe(f, "action", shape=2), r"features\.action\.shape: expected a list such as \[2\], got 2"),
+    "a table without rows": ("lerobot 3", lambda f: change_table(f, lambda rows: rows.slice(0, 0)), r"file-000\.parquet: expected rows, got none"),
     "an image in two records": ("tub 2", lambda f: edit(f / "catalog_1.catalog", {"cam/image_array": "3_cam_image_array_.jpg"}), r"catalog_1\.catalog:5: expected an image that nothing else has, got \S*3_cam_image_array_\.jpg, which \S*catalog_0\.catalog:4 has"),
     "a row twice": ("udacity", lambda f: (f / "driving_log.csv").write_text((f / "driving_log.csv").read_text() + (f / "driving_log.csv").read_text().split("\n")[1]), r"driving_log\.csv:14: expected an image that nothing else has, got .* which \S*driving_log\.csv:2 has"),
     "an index as text": ("tub 2", lambda f: (edit(f / "catalog_1.catalog", {"_index": "9"}), edit(f / "manifest.json", {"deleted_indexes": [9]})), r"catalog_1\.catalog:5: _index: expected a number, as records are deleted by theirs, got '9'"),
@@ -242,6 +266,48 @@ def test_random_damage_of_a_lerobot_data_set_never_escapes_as_another_error(tmp_
             with contextlib.suppress(AdvnerfError):
                 list(open_log(folder).frames())
         (folder / name).write_bytes(content)
+
+
+@pytest.mark.parametrize("form", ["lerobot 2", "lerobot 3", "lerobot images"])
+def test_the_episodes_of_a_lerobot_data_set_are_kept_apart(tmp_path, form):
+    log = open_log(
+        FORMATS[form](tmp_path / "log"), LogChoice(steering_full_rad=0.4, steering_positive="left")
+    )
+    assert write_lerobot(log, tmp_path / "out").episodes == 3
+    view = view_for_size(64, 48)
+    for each in (log, open_log(tmp_path / "out")):
+        frames = frames_of(each, view, None, "recorded")
+        assert (frames.has_times, frames.drive_starts()) == (True, [0, 4, 8])
+
+
+def test_times_that_go_back_start_another_drive_and_rows_without_times_do_not(tmp_path):
+    pytest.importorskip("pyarrow")
+    choice, view = LogChoice(steering_full_rad=0.4), view_for_size(64, 48)
+    folder = write_tub_2(tmp_path / "tub")
+    second = folder / "catalog_1.catalog"
+    second.write_text(second.read_text().replace("17000000", "16999990"))
+    log = open_log(folder, choice)
+    assert write_lerobot(log, tmp_path / "out").episodes == 3
+    assert frames_of(log, view, None, "recorded").drive_starts() == [0, 5, 10]
+    rows = frames_of(open_log(write_udacity(tmp_path / "rows", True, "IMG/")), view, None, "recorded")
+    assert (rows.has_times, rows.drive_starts()) == (False, [0])
+
+
+@pytest.mark.parametrize(
+    ("step_ms", "rate_hz", "said"),
+    [
+        (100, 30, "--rate: expected about 10, the images per second of .*tub, got 30; leave it out"),
+        (100, 12, ""),
+        (2000, None, ""),
+        (None, 5000, "--rate: expected 1 to 1000 images per second, got 5000"),
+    ],
+)
+def test_an_export_keeps_the_speed_of_the_drive(tmp_path, step_ms, rate_hz, said):
+    pytest.importorskip("pyarrow")
+    log = open_log(write_tub_2(tmp_path / "tub", step_ms=step_ms), LogChoice(steering_full_rad=0.4))
+    with pytest.raises(LogError, match=said) if said else contextlib.nullcontext():
+        assert write_lerobot(log, tmp_path / "out", rate_hz).rate_hz == (rate_hz or 1)
+    assert (tmp_path / "out").exists() == (not said)
 
 
 def test_what_is_no_log_is_told_apart(tmp_path):
