@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import LagS, StrictModel
 from calibration.schema import VehicleCalibration, load_calibration
 from hardware.errors import HardwareError, ProtocolError
 from hardware.motor.limits import DriveLimits, Sent
@@ -72,8 +72,8 @@ class MotorConfig(StrictModel):
     brake_ramp_s: float = Field(default=0.1, ge=0.0, le=0.5)
     brake_hold_s: float = Field(default=1.0, gt=0.0)
     current_max_a: float | None = Field(default=None, gt=0.0)
-    link_timeout_s: float = Field(default=0.2, gt=0.0)
-    controller_timeout_ms: int = Field(default=1000, gt=0)
+    link_timeout_s: LagS = Field(default=0.2, gt=0.0)
+    controller_timeout_ms: int = Field(default=1000, gt=0, le=5000)
     controller_brake_current_a: float = Field(default=0.0, ge=0.0)
     steering_check: Literal["required", "unless_twin", "never"] = "unless_twin"
     steering_angle_rad: float = Field(default=0.2, gt=0.0, le=0.4)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import LagS, LengthM, RightAngleRad, SpeedMps, StrictModel
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from nodes.control.arming import Arming, ArmingLimits
 from nodes.control.arming_gates import ClockGate, HandGate
@@ -82,22 +82,22 @@ class SafetyConfig(StrictModel):
     drivers: tuple[Literal["expert", "policy"], ...] = Field(default=("policy",), min_length=1)
     teleop: Literal["none", "hold"] = "none"
     teleop_age_limit_s: float = Field(default=0.2, gt=0.05, le=0.25)
-    fence_margin_m: float = Field(default=0.0, ge=0.0)
+    fence_margin_m: LengthM = Field(default=0.0, ge=0.0)
     clock_offset_limit_s: float = Field(default=0.03, gt=0.0, le=0.1)
-    clock_error_limit_s: float = Field(default=0.1, gt=0.0)
+    clock_error_limit_s: LagS = Field(default=0.1, gt=0.0)
     clock_peers: tuple[str, ...] = ()
-    max_speed_mps: float = Field(default=1.0, gt=0.0)
-    max_steering_rad: float = Field(default=0.6, gt=0.0)
+    max_speed_mps: SpeedMps = Field(default=1.0, gt=0.0)
+    max_steering_rad: RightAngleRad = Field(default=0.6, gt=0.0)
     drive_age_limit_s: float = Field(default=0.22, gt=0.0, le=0.25)
     image_age_limit_s: float = Field(default=0.25, gt=0.0, le=0.3)
     pose_age_limit_s: float = Field(default=0.2, gt=0.0, le=0.25)
-    status_age_limit_s: float = Field(default=1.0, gt=0.2)
+    status_age_limit_s: LagS = Field(default=1.0, gt=0.2)
     held_up_limit_s: float = Field(default=0.2, gt=0.04, le=0.25)
     motion_margin: float = Field(default=1.25, ge=1.0, le=3.0)
     pose_noise_m: float = Field(default=0.005, gt=0.0, le=0.05)
     pose_noise_rad: float = Field(default=0.01, gt=0.0, le=0.1)
-    stall_command_mps: float = Field(default=0.3, gt=0.0)
-    stall_speed_mps: float = Field(default=0.1, gt=0.0)
+    stall_command_mps: SpeedMps = Field(default=0.3, gt=0.0)
+    stall_speed_mps: SpeedMps = Field(default=0.1, gt=0.0)
     stall_time_s: float = Field(default=1.0, ge=0.3, le=10.0)
     stall_sources: tuple[Literal["mocap", "erpm"], ...] = Field(default=("mocap", "erpm"), min_length=1)
 

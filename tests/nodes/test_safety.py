@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from advnerf_core.geometry import planar_pose
 from calibration.schema import VehicleCalibration, load_calibration
 from nodes.control.arming import ArmingLimits
+from nodes.motor import MotorConfig
 from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.clock import Now
 from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_message, types
@@ -292,3 +293,28 @@ def test_a_standing_start_and_slow_commands_are_no_stall(drive):
 def test_a_stall_must_be_slower_than_its_command():
     with pytest.raises(ValidationError, match="every drive would be a stall"):
         SafetyConfig(room=TWIN / "room.yaml", vehicle=TWIN / "vehicle.yaml", stall_speed_mps=0.3)
+
+
+@pytest.mark.parametrize(
+    ("model", "key", "value", "said"),
+    [
+        (SafetyConfig, "max_steering_rad", 35.0, "at most 1.5708 rad, not degrees"),
+        (SafetyConfig, "max_speed_mps", 100.0, "at most 50 m/s, not km/h or mm/s"),
+        (SafetyConfig, "status_age_limit_s", 1000.0, "at most 5 s, not ms"),
+        (SafetyConfig, "clock_error_limit_s", 100.0, "at most 5 s, not ms"),
+        (SafetyConfig, "stall_command_mps", 300.0, "at most 50 m/s"),
+        (SafetyConfig, "fence_margin_m", 100.0, "at most 20 m, not cm or mm"),
+        (MotorConfig, "link_timeout_s", 200.0, "at most 5 s, not ms"),
+        (MotorConfig, "controller_timeout_ms", 250_000, "less than or equal to 5000"),
+    ],
+)
+def test_a_limit_in_another_unit_guards_nothing_and_is_refused(model, key, value, said):
+    calibrations = {
+        "room": TWIN / "room.yaml",
+        "calibration": TWIN / "vehicle.yaml",
+        "vehicle": TWIN / "vehicle.yaml",
+    }
+    needed = {name: file for name, file in calibrations.items() if name in model.model_fields}
+    port = {"port": "/dev/vesc"} if model is MotorConfig else {}
+    with pytest.raises(ValidationError, match=said):
+        model(**needed, **port, **{key: value})
