@@ -24,7 +24,9 @@ def node_list(run_dir: RunDir = None) -> None:
 
     run = find_run_dir(run_dir)
     rows = table("node", "state", "process", "text")
-    for name, status in sorted(node_statuses(run).items()):
+    statuses = node_statuses(run)
+    _require_nodes(bool(statuses), run)
+    for name, status in sorted(statuses.items()):
         if status is None:
             silence = describe_silence(run, name)
             rows.add_row(name, SILENT, str(silence.pid or "-"), silence.text)
@@ -51,8 +53,20 @@ def _watch(run_dir: Path, period_s: float, count: int | None) -> None:
     shown = 0
     with NodeWatch(run_dir) as watch:
         while count is None or shown < count:
-            _print(watch.rows(period_s))
+            found = watch.rows(period_s)
+            _require_nodes(bool(found), run_dir)
+            _print(found)
             shown += 1
+
+
+def _require_nodes(found: bool, run: Path) -> None:
+    """Refuse the folder of a run that has no node: an empty table says nothing."""
+    if not found:
+        from nodes.runtime.errors import LaunchError
+
+        raise LaunchError(
+            f"expected nodes of a launch in {run}, found none; start one with advnerf launch FILE, or correct --folder"
+        )
 
 
 def _print(found: list[NodeRow]) -> None:

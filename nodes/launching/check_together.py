@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import runpy
 import sys
 
@@ -17,13 +18,18 @@ from advnerf_core.documents import parse_json
 
 def main() -> None:
     """Ask each node as ``python -m MODULE --check`` would."""
+    answers = os.dup(sys.stdout.fileno())
+    os.dup2(
+        sys.stderr.fileno(), sys.stdout.fileno()
+    )  # libraries of C print there, such as a camera's when it is loaded
     problems = {}
     for name, module, config, folder in parse_json(sys.stdin.read(), "standard input"):
         if (
             problem := _problem(name, module, ["--check", "--config", config, "--folder", folder])
         ) is not None:
             problems[name] = problem
-    print(json.dumps(problems))
+    with open(answers, "w", encoding="utf-8") as answered:
+        json.dump(problems, answered)
 
 
 def _problem(name: str, module: str, arguments: list[str]) -> str | None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from advnerf_core.documents import read_yaml
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.paths import RESOLVED_NAME
 
 
@@ -38,12 +40,26 @@ class Launched:
         return f"{what}, {self.vehicle}" if self.vehicle else what
 
 
+def _is_node(entry: Any) -> bool:
+    return isinstance(entry, dict) and isinstance(entry.get("config") or {}, dict)
+
+
 def read_launched(run_dir: Path) -> Launched:
-    """Read the resolved launch file of a run, if there is one."""
+    """Read the resolved launch file of a run, if there is one.
+
+    Raises:
+        ConfigError: The file is damaged, or is not what a launch writes.
+    """
+    file = run_dir / RESOLVED_NAME
     try:
-        entries = read_yaml(run_dir / RESOLVED_NAME).data.get("nodes") or {}
+        launch = read_yaml(file).data
     except FileNotFoundError:
         return Launched()
+    entries = (launch.get("nodes") or {}) if isinstance(launch, dict) else None
+    if not isinstance(entries, dict) or not all(map(_is_node, entries.values())):
+        raise ConfigError(
+            f"{file}: expected nodes with their keys, as advnerf launch writes them, got others; start the launch again"
+        )
     enabled = {name: entry for name, entry in entries.items() if entry.get("if", True)}
     of_module = {entry.get("module"): entry.get("config") or {} for entry in enabled.values()}
     safety = of_module.get("nodes.safety")

@@ -221,6 +221,27 @@ def test_the_check_tells_bgr_from_rgb(tmp_path: Path) -> None:
         CHECKS["colours"](CameraBench(camera, shows="blue"))
 
 
+@pytest.mark.parametrize(
+    ("first", "said"),
+    [
+        ("import os; os.write(1, b'SDK 1.0\\n')", ""),  # as libraries of C print, past sys.stdout
+        ("import os; os._exit(0)", "expected an answer of each node, got none: a module ends the process"),
+    ],
+)
+def test_a_module_that_prints_or_ends_the_process_does_not_hide_the_answers(
+    tmp_path: Path, first: str, said: str
+) -> None:
+    (tmp_path / "mine.py").write_text(f"{first}\n{GENERATOR}")
+    config = {"calibration": str(TWIN), "source": {"kind": "mine.py:Generator", "width": 336}}
+    file = tmp_path / "my.launch.yaml"
+    file.write_text(
+        dump_yaml({"name": "mine", "nodes": {"camera": {"module": "nodes.camera", "config": config}}})
+    )
+    found = check_nodes(load_launch(file))
+    assert said in found.get("nodes", "")
+    assert bool(found) == bool(said)
+
+
 def test_a_relative_file_is_relative_to_the_launch_file_that_names_it(
     generator: Path, tmp_path: Path
 ) -> None:

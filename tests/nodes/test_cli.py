@@ -143,6 +143,12 @@ def test_a_node_that_hangs_is_listed_as_silent_with_its_age(running, command):
     assert rows["sender"] == command("car", "node", "list", "--folder", running)[1].splitlines()[1].split()
 
 
+@pytest.mark.parametrize("words", [("node", "list"), ("top", "--period", "0.5")])
+def test_a_folder_without_nodes_is_no_empty_table(tmp_path, command, words):
+    code, _, error = command("car", *words, "--folder", tmp_path)
+    assert (code, f"expected nodes of a launch in {tmp_path}, found none" in error) == (2, True)
+
+
 def test_topic_hz_measures_the_rate(running, command):
     code, output, _ = command("car", "topic", "hz", "/vicon/car", "--duration", 1, "--folder", running)
     assert code == 0

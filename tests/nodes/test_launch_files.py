@@ -6,6 +6,9 @@ import pytest
 
 from nodes.launching.launch_check import check_nodes
 from nodes.launching.launch_file import load_launch
+from nodes.launching.launched import Launched, read_launched
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.paths import RESOLVED_NAME
 
 pytestmark = pytest.mark.live
 
@@ -103,3 +106,15 @@ def test_the_safety_node_watches_the_one_that_speaks_to_ros(file):
 )
 def test_every_node_accepts_its_configuration(file, host):
     assert check_nodes(load_launch(LAUNCH / f"{file}.launch.yaml", host=host)) == {}
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", "nodes: [motor]", "nodes: {motor: 3}", "nodes: {motor: {config: [3]}}"]
+)
+def test_a_resolved_file_that_was_edited_is_one_line(tmp_path, text):
+    assert read_launched(tmp_path) == Launched()
+    (tmp_path / RESOLVED_NAME).write_text("nodes: {motor: {module: nodes.motor, config: {port: /dev/vesc}}}")
+    assert read_launched(tmp_path).car(tmp_path) == "a REAL car at /dev/vesc"
+    (tmp_path / RESOLVED_NAME).write_text(text)
+    with pytest.raises(ConfigError, match="expected nodes with their keys, as advnerf launch writes them"):
+        read_launched(tmp_path)
