@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from advnerf_core.unit_bounds import MOST_SPEED_MPS
 from nodes.cli import policy_train as cli_policy_train
 from nodes.cli.policy_train import Goal
 from nodes.runtime.findings import CheckFinding
@@ -163,6 +164,7 @@ def policy_serve(
         typer.Option(
             "--speed",
             min=0.0,
+            max=MOST_SPEED_MPS,
             help="Speed of the plans [m/s].",
             show_default="the car's own; not used with waypoints",
         ),

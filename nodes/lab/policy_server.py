@@ -28,6 +28,7 @@ from carla_driver_interface.service import EgodriverServicer, ServiceMode
 from numpy.typing import NDArray
 
 from advnerf_core.policies.driver import Driver, require_goal
+from advnerf_core.unit_bounds import MOST_LENGTH_M
 from nodes.linking.keys import is_loopback
 from nodes.operator_page.certificate import certificate
 from nodes.runtime.errors import ConfigError
@@ -60,7 +61,7 @@ class ServedPolicy(BaseDriver):
         name: Name of the driver; the start of the policy's hash follows.
 
     Raises:
-        ConfigError: The policy steers and the wheelbase is missing, or its goal has another length.
+        ConfigError: The policy steers and the wheelbase is missing or in another unit, or its goal has another length.
     """
 
     def __init__(self, driver: Driver, name: str, car: ServedCar) -> None:
@@ -69,6 +70,10 @@ class ServedPolicy(BaseDriver):
         if contract.trajectory is None and self.wheelbase_m is None:
             raise ConfigError(
                 "expected a wheelbase for a policy that answers with wheel angles; give --wheelbase of the car that it was trained for"
+            )
+        if self.wheelbase_m is not None and not 0.0 < self.wheelbase_m <= MOST_LENGTH_M:
+            raise ConfigError(
+                f"--wheelbase: expected metres above 0 and at most {MOST_LENGTH_M:g}, not cm or mm, got {self.wheelbase_m:g}; correct it"
             )
         require_goal(car.goal, driver.goal_size, "give --goal")
         self.name = f"{name}-{driver.sha256[:12]}"
@@ -98,7 +103,11 @@ class ServedPolicy(BaseDriver):
         self._sessions.pop(session.uuid, None)
 
     def drive(self, ctx: DriveContext) -> DriveResult:
-        """The policy's plan in the car's frame; an empty one, which holds the car, before the first picture."""
+        """The policy's plan in the car's frame; an empty one, which holds the car, before the first picture.
+
+        Raises:
+            ValueError: The policy's answer is no finite number.
+        """
         camera, driver = self._sessions[ctx.session.uuid]
         frame = ctx.session.latest_frame(camera)
         plan = Trajectory.empty()
@@ -115,6 +124,10 @@ class ServedPolicy(BaseDriver):
             times_s = np.arange(1, round(_HORIZON_S / _PERIOD_S) + 1) * _PERIOD_S
             speed_mps = ctx.session.speed_mps() if self._car.speed_mps is None else self._car.speed_mps
             poses = _arc(np.tan(steering_rad) / float(self.wheelbase_m or 0.0), speed_mps * times_s)
+        if not np.isfinite(poses).all():
+            raise ValueError(
+                f"expected a finite plan from {self.name}, got one with NaN or infinity; look at it with advnerf policy check"
+            )
         for time_s, (x, y, yaw) in zip(times_s, poses, strict=True):
             plan.append(ctx.time_now_us + round(time_s * _US_PER_S), Pose.from_xyz_yaw(x, y, 0.0, yaw))
         return DriveResult(trajectory_in_rig=plan, debug_scalars={"steering_rad": steering_rad})

@@ -155,6 +155,25 @@ def test_other_computers_are_served_by_tls(tmp_path, monkeypatch):
             FakeLoop(channel, [CAMERA], timeout_s=5.0).run(1)
 
 
+@pytest.mark.parametrize("wheelbase_m", [0.0, 29.0, 2900.0])
+def test_a_wheelbase_in_another_unit_would_plan_straight_on(wheelbase_m):
+    with pytest.raises(
+        ConfigError, match="--wheelbase: expected metres above 0 and at most 20, not cm or mm, got"
+    ):
+        ServedPolicy(driver_of(constant), "constant", ServedCar(wheelbase_m))
+
+
+def test_an_answer_that_is_no_number_is_no_plan():
+    served = ServedPolicy(
+        driver_of(lambda images: images.mean((1, 2, 3)) * np.nan), "nan", ServedCar(WHEELBASE_M)
+    )
+    with (
+        serving(served, "127.0.0.1:0") as address,
+        pytest.raises(grpc.RpcError, match="expected a finite plan from nan-"),
+    ):
+        FakeLoop(target(address), [CAMERA], initial_speed_mps=4.0).run(3)
+
+
 def test_what_is_missing_is_said():
     with pytest.raises(ConfigError, match="give --wheelbase"):
         ServedPolicy(driver_of(constant), "constant", ServedCar())
