@@ -54,9 +54,10 @@ class RecordedFrames:
 
     def drive_starts(self) -> list[int]:
         """Numbers of the frames before which the log pauses or goes back, with the first: there a policy has no memory."""
+        if not self.has_times:
+            return [0]
         steps_s = np.abs(np.diff(self.stamps_ns)) / NS_PER_S
-        pauses = np.flatnonzero(steps_s > _NEW_DRIVE_S) + 1 if self.has_times else ()
-        return [0, *map(int, pauses)]
+        return [0, *map(int, np.flatnonzero(steps_s > _NEW_DRIVE_S) + 1)]
 
 
 def frames_of(log: DriveLog, view: PolicyView, expert: Expert | None, labels: Labels) -> RecordedFrames:
