@@ -19,7 +19,7 @@ from calibration.display_colour import (
     fit_display,
     mean_colour,
 )
-from calibration.schema import load_calibration
+from calibration.schema import CalibrationError, load_calibration
 from hardware.worlds.paths import Pose
 from hardware.worlds.world import NativePanels, Panel, World
 from nodes.experiment.plan.placed import PlacedObject
@@ -46,9 +46,7 @@ def measure_light(experiment: Experiment, world: World) -> DisplayFit:
     """Show plain colours on the one placed panel, look at them along the drive, and fit the response. The panel is taken away afterwards.
 
     Raises:
-        ConfigError: No drive sees the panel large enough.
-        DegenerateDataError: The colours do not determine the light, for example because all are too bright.
-        PoorFitError: The model does not fit the light.
+        ConfigError: No drive sees the panel large enough, or the model does not fit the light, such as one that depends on where the car is.
     """
     assert isinstance(world, NativePanels), "experiments are refused where their world takes no panels"
     (thing,) = experiment.objects
@@ -67,7 +65,16 @@ def measure_light(experiment: Experiment, world: World) -> DisplayFit:
     finally:
         world.add_panel(_NAME, panel, None)
     # Paint has no falloff: the viewing angle does not matter.
-    return fit_display(np.repeat(colours / 255.0, len(poses), axis=0), np.array(seen), least_free=_LEAST_FREE)
+    try:
+        return fit_display(
+            np.repeat(colours / 255.0, len(poses), axis=0), np.array(seen), least_free=_LEAST_FREE
+        )
+    except CalibrationError as error:
+        found = str(error).partition(": ")[0]  # what follows helps with a monitor in front of a camera
+        raise ConfigError(
+            f"{experiment.file}: carrier.response measured: expected light on the panel {thing.name} that does not depend on where the car is, and "
+            f"a curve per channel that fits it, got: {found}; set carrier.response=identity"
+        ) from error
 
 
 def _poses(experiment: Experiment, world: World, thing: PlacedObject) -> list[Pose]:

@@ -119,3 +119,21 @@ def test_the_region_is_where_the_camera_sees_the_panel(measured) -> None:
     assert (columns.mean() + 0.5, rows.mean() + 0.5) == pytest.approx(
         tuple(middle), abs=2.5
     )  # the nearer half is larger
+
+
+def test_light_that_depends_on_where_the_car_is_is_refused_in_words_for_a_world(
+    measured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As that of a lamp on the car."""
+    experiment, world, _ = measured
+    seen = world.observe_at
+
+    def with_a_lamp(x_m: float, y_m: float, yaw_rad: float, depth: bool = True):
+        rgb, found = seen(x_m, y_m, yaw_rad, depth)
+        return (rgb * (0.7 + 0.1 * np.clip(x_m, -1.0, 1.0))).astype(np.uint8), found
+
+    monkeypatch.setattr(world, "observe_at", with_a_lamp)
+    with pytest.raises(
+        ConfigError, match=r"does not depend on where the car is.*set carrier\.response=identity$"
+    ):
+        measure_light(experiment, world)
