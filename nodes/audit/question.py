@@ -97,6 +97,7 @@ def experiment_data(question: AuditedQuestion) -> dict[str, Any]:
         "carrier": {"kind": "composed"},
         "space": {"kind": "colours", "cells": 8},
         "deploy": {"through": "world" if place.is_driven else "nothing"},
+        "scene": {"bake_unbounded": True},
         "measure": {"starts": SELECTION_STARTS, "seed": SELECTION_SEED, "scene": "baked"},
         "retrain": None,
         "reference": None,
