@@ -69,7 +69,10 @@ def place_elsewhere(
         )
     # The output of the capture stage belongs to the attacked place.
     vars(there)["world"] = found
-    vars(there)["objects"] = tuple(place_by_rule(there, world))
+    try:
+        vars(there)["objects"] = tuple(place_by_rule(there, world))
+    except ConfigError as error:
+        raise ConfigError(f"policy.learns_in: {' '.join(changes)}: {error}") from error
     return there, world
 
 

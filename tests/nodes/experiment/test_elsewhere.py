@@ -109,6 +109,19 @@ def test_a_place_with_another_car_is_refused(tmp_path: Path) -> None:
         plans_elsewhere(experiment, opened)
 
 
+def test_a_place_without_a_spot_for_the_object_is_named(tmp_path: Path) -> None:
+    experiment = experiment_in(
+        tmp_path,
+        "policy.learns_in=[[seed=2]]",
+        "objects=[{name: board, kind: panel, scale: 0.1, stands: {}}]",
+    )
+    with (
+        ExitStack() as opened,
+        pytest.raises(ConfigError, match=r"^policy\.learns_in: seed=2: .*expected a spot"),
+    ):
+        plans_elsewhere(experiment, opened)
+
+
 def test_what_cannot_be_learned_elsewhere_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="all stand by a rule"):
         experiment_in(tmp_path, "policy.own_car=true")
