@@ -18,10 +18,9 @@ from advnerf_core.documents import parse_json
 
 def main() -> None:
     """Ask each node as ``python -m MODULE --check`` would."""
+    # Libraries of C print to the output, such as a camera's when it is loaded.
     answers = os.dup(sys.stdout.fileno())
-    os.dup2(
-        sys.stderr.fileno(), sys.stdout.fileno()
-    )  # libraries of C print there, such as a camera's when it is loaded
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     problems = {}
     for name, module, config, folder in parse_json(sys.stdin.read(), "standard input"):
         if (

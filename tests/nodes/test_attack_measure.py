@@ -85,15 +85,7 @@ def test_a_photograph_gives_pose_and_colours_and_with_one_length_the_size(call, 
         [(scaled(poster(folder), scale, scale, 75.0), T)], LENS, light=(0.9, 0.75, 0.6), slope=0.4
     )
     write_image(folder / "photo.jpg", picture)
-    command = (
-        "attack",
-        "measure",
-        folder / "photo.jpg",
-        "--print",
-        folder / "p.print.json",
-        "--camera",
-        folder / "lens.yaml",
-    )
+    command = measure_command(folder, "photo.jpg")
     code, said = call(*command)
     assert code == 0
     assert "12 of 12" in said
@@ -123,15 +115,7 @@ def test_a_chart_beside_it_is_a_card(call, folder):
     sheets = [(make_chart("a4"), beside), (scaled(poster(folder), 0.98, 0.98, 75.0), T)]
     picture = photograph(sheets, LENS, dpi=100.0)
     write_image(folder / "photo.png", picture)
-    command = (
-        "attack",
-        "measure",
-        folder / "photo.png",
-        "--print",
-        folder / "p.print.json",
-        "--camera",
-        folder / "lens.yaml",
-    )
+    command = measure_command(folder, "photo.png")
     code, said = call(*command, "--card", folder / "chart.print.json")
     assert code == 0, said
     found = json.loads((folder / "photo.measured.json").read_text())
@@ -142,14 +126,19 @@ def test_a_chart_beside_it_is_a_card(call, folder):
     assert (code, "expected the record of a chart, got that of a poster" in said) == (2, True)
 
 
+def measure_command(folder, photograph):
+    """The words that measure a photograph of the print ``p.png``."""
+    files = folder / photograph, "--print", folder / "p.print.json", "--camera", folder / "lens.yaml"
+    return "attack", "measure", *files
+
+
 @pytest.fixture
 def measuring(folder):
     """The words that measure a photograph of everything but the print."""
     save_record(*record_beside(poster(folder), folder / "a.attack.safetensors", folder / "p.png", 50.0))
     noise = np.random.default_rng(0).integers(0, 256, (720, 960, 3)).astype(np.uint8)
     write_image(folder / "photo.png", noise)
-    files = folder / "photo.png", "--print", folder / "p.print.json", "--camera", folder / "lens.yaml"
-    return "attack", "measure", *files
+    return measure_command(folder, "photo.png")
 
 
 def test_a_photograph_without_the_print_is_refused(call, measuring):
@@ -200,10 +189,7 @@ def test_damaged_and_irrelevant_files_are_refused_in_one_line(call, folder, meas
 def test_a_picture_of_any_kind_is_no_bag(call, folder, name):
     call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 20)
     (folder / name).write_bytes(b"no picture")
-    code, said = call(
-        "attack", "measure", folder / name, "--print", folder / "p.print.json", "--camera", folder / "lens.yaml",
-        "--distance", "1",
-    )  # fmt: skip
+    code, said = call(*measure_command(folder, name), "--distance", "1")
     assert (code, "expected a readable image" in said) == (2, True), said
 
 
@@ -255,18 +241,7 @@ def test_a_drive_gives_size_pose_flatness_and_the_effect_where_it_hangs(call, se
     assert min(effect[key] for key in ("clean_m", "nominal_m", "print_m")) >= 0.0
 
 
-def test_a_yaw_in_degrees_is_refused(call, folder):
-    (folder / "photo.png").touch()
-    call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 20)
-    measuring = (
-        "attack",
-        "measure",
-        folder / "photo.png",
-        "--print",
-        folder / "p.print.json",
-        "--camera",
-        folder / "lens.yaml",
-    )
+def test_a_yaw_in_degrees_is_refused(call, measuring):
     for car in ("1,2,90", "1,nan,0", "inf,2,0"):
         code, said = call(*measuring, "--car", car)
         assert (code, "in m and rad" in said) == (2, True), said
@@ -288,9 +263,7 @@ def test_no_input_is_overwritten(call, folder):
     call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 50)
     (folder / "photo.png").touch()
     before = {file: file.read_bytes() for file in folder.iterdir()}
-    command = (
-        "attack", "measure", folder / "photo.png", "--print", folder / "p.print.json", "--camera", folder / "lens.yaml", "-o",
-    )  # fmt: skip
+    command = *measure_command(folder, "photo.png"), "-o"
     given = ("photo.png", "photo.json", "p.print.json", "lens.yaml", "a.attack.safetensors")
     for output, refusal in [*((name, "would be overwritten") for name in given), ("new.png", "two files")]:
         code, said = call(*command, folder / output)

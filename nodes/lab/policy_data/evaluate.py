@@ -97,15 +97,12 @@ def predict(
     Raises:
         ConfigError: The policy answers an image by no finite number.
     """
-    has_memory = not getattr(policy, "stateless", True)
-    parts, batch, current = (
-        [],
-        1 if has_memory else _BATCH,
-        policy,
-    )  # with memory in driving order, one by one
+    has_memory, begun = not getattr(policy, "stateless", True), {0, *drive_starts}
+    batch = 1 if has_memory else _BATCH  # with memory one by one, in driving order
+    parts, current = [], policy
     with torch.no_grad():
         for start in range(0, len(images), batch):
-            if has_memory and (not start or start in drive_starts):
+            if has_memory and start in begun:
                 current = Remembering.afresh(policy, 1)
             parts.append(_steer(current, _tensor(images[start : start + batch]), goal).double().numpy())
     predicted_rad = np.concatenate(parts)

@@ -122,9 +122,8 @@ def measure(
         PrintError: The record is of another print.
     """
     sheet = printed_sheet(record, attack)
-    if source.is_file() and not is_bag_file(
-        source
-    ):  # phones write .heic, and there are pictures without any suffix
+    # What is no bag is a picture: phones write .heic, and some have no suffix.
+    if source.is_file() and not is_bag_file(source):
         lens = load_lens(camera) if known.car is None else load_calibration(CameraCalibration, camera)
         return _measure_photograph(source, record, sheet, lens, known)
     if known != KnownLength():
