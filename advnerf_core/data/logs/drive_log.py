@@ -152,7 +152,8 @@ class DriveLog:
             return "no times"
         if not self.rate_hz:
             return "times that go back or repeat"
-        return f"{self.rate_hz:.3g} Hz" + (": times in another unit" if self.rate_hz > FASTEST_HZ else "")
+        digits = ",.0f" if self.rate_hz >= 1000.0 else ".3g"
+        return f"{self.rate_hz:{digits}} Hz" + (": times in another unit" if self.rate_hz > FASTEST_HZ else "")
 
     def first_image(self) -> Rgb:
         """The first image.

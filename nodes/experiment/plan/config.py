@@ -250,7 +250,7 @@ class ExperimentConfig(StrictModel):
             rules.check_own_scene(self.space, objects, self.attack)
         else:
             rules.check_space(self.space, objects, self.attack, self.deploy)
-        rules.check_searches(self.methods, self.seeds, self.measure.seed, retrain is not None)
+        rules.check_searches(self.methods, self.seeds, self.measure, self.deploy, retrain is not None)
         rules.check_methods(self.methods, self.attack, self.own_scene)
         rules.check_drives(self.attack, self._recipes, retrain, self.horizon, self.dt_s)
         return self

@@ -10,7 +10,7 @@ from nodes.experiment.plan.carriers import CarrierConfig, FaceCarrier
 from nodes.experiment.plan.deploy_config import DeployConfig
 from nodes.experiment.plan.object_kinds import OBJECT_SUFFIX, PANEL, name_of
 from nodes.experiment.plan.placed import FLAT, PlacedObject, WantedObject
-from nodes.experiment.plan.sections import AttackConfig, PolicyConfig, RetrainConfig
+from nodes.experiment.plan.sections import AttackConfig, MeasureConfig, PolicyConfig, RetrainConfig
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
     MeshShapeConfig,
@@ -192,15 +192,21 @@ def check_methods(methods: Sequence[str], attack: AttackConfig, own_scene: bool)
     )
 
 
-def check_searches(methods: Sequence[str], seeds: Sequence[int], measured_seed: int, retrains: bool) -> None:
-    """Raise for searches that use the measured starts, and for a retraining without its gradient."""
+def check_searches(
+    methods: Sequence[str], seeds: Sequence[int], measure: MeasureConfig, deploy: DeployConfig, retrains: bool
+) -> None:
+    """Raise for searches that use the measured starts, deployed starts that are not measured, and a retraining without its gradient."""
     _refuse(
         retrains and "gradient" not in methods,
         f"expected gradient among over.method, as retrain learns from what it finds, got {', '.join(methods)}",
     )
     _refuse(
-        measured_seed in seeds,
-        f"expected measure.seed to be none of over.seed, as no search may have the starts that are measured, got {measured_seed}",
+        measure.seed in seeds,
+        f"expected measure.seed to be none of over.seed, as no search may have the starts that are measured, got {measure.seed}",
+    )
+    _refuse(
+        deploy.starts is not None and deploy.starts > measure.starts,
+        f"expected deploy.starts to be at most measure.starts = {measure.starts}, of which it takes the first, got {deploy.starts}",
     )
 
 

@@ -11,7 +11,7 @@ from advnerf_core.data.logs.csv_log import UDACITY_FILE, read_csv_log
 from advnerf_core.data.logs.donkey import MANIFEST, META, read_tub
 from advnerf_core.data.logs.drive_log import DriveLog, Labels
 from advnerf_core.data.logs.lerobot import INFO, read_lerobot
-from nodes.bags.parts import METADATA_FILE, SUFFIXES, holds_bag
+from nodes.bags.parts import holds_bag, is_bag_file
 from nodes.lab.policy_data.bag_log import read_bag_log
 
 _FORMATS = (
@@ -82,7 +82,7 @@ def open_log(path: Path, choice: LogChoice | None = None) -> DriveLog:
     choice = choice or LogChoice()
     if path.suffix.lower() == ".csv":
         return read_csv_log(path, choice)
-    if path.suffix in SUFFIXES or path.name == METADATA_FILE:
+    if is_bag_file(path):
         return read_bag_log(path, choice)
     if path.is_dir():
         if (path / INFO).is_file():

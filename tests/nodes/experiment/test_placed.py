@@ -93,9 +93,10 @@ def test_what_stands_in_a_lane_is_found(
         ),
         ("attack.response={delay_s: 160}", r"delay_s: .*5"),
         ("over.seed=[-1]", "over.seed.*0"),
+        ("deploy.starts=6", r"deploy\.starts to be at most measure\.starts = 5, .* got 6"),
     ],
 )
-def test_degrees_milliseconds_and_negative_seeds_are_refused_at_once(
+def test_numbers_that_no_experiment_can_mean_are_refused_at_once(
     tmp_path: Path, change: str, told: str
 ) -> None:
     with pytest.raises(ValueError, match=told):

@@ -115,7 +115,7 @@ def test_a_stage_depends_on_its_own_settings_and_on_no_others(tmp_path):
         assert list(before) == ["capture", "scene", "bake", "object", "policy"]
         return {name for name in before if before[name] != after[name]}
 
-    assert changed("attack.evaluations=7") == changed("space.cells=4") == changed("deploy.starts=2") == set()
+    assert changed("attack.evaluations=7") == changed("space.cells=4") == changed("deploy.laps=0") == set()
     assert changed("attack.random_sigma=4") == {"policy"}
     assert changed("scene.exposure=true") == changed("scene.decay=exponential") == {"scene"}
     assert changed("scene.learning_rate=0.01") == {"scene"}

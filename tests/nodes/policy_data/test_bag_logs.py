@@ -69,6 +69,12 @@ def write_bag(folder, pause_after=12, braking=(5, 6), disturbed=(15,)):
     return folder
 
 
+def test_a_bag_is_one_in_capital_letters_too(tmp_path):
+    part = next(write_bag(tmp_path / "bag").glob("*.mcap"))
+    copied = part.rename(tmp_path / "DRIVE.MCAP")
+    assert open_log(copied).count == COUNT
+
+
 @pytest.mark.parametrize("labels", ["recorded", "expert"])
 def test_a_bag_that_was_exported_gives_the_same_frames(tmp_path, monkeypatch, labels):
     pytest.importorskip("pyarrow")

@@ -431,7 +431,7 @@ def test_the_commands_train_on_several_logs_and_evaluate_held_out_frames(tmp_pat
         (0, "times that go back or repeat"),
         (None, "no times"),
         (4000, "0.25 Hz"),
-        (0.1, "9.99e+03 Hz: times in another unit"),
+        (0.1, "9,986 Hz: times in another unit"),
     ],
 )
 def test_what_is_wrong_with_the_times_of_a_log_is_said(tmp_path, monkeypatch, capsys, step_ms, said):
