@@ -2,7 +2,8 @@
 
 Reads published gap sets (`launch/gap_*.experiment.yaml`): the difference between the gradient and the random family that is strongest in the
 surrogate, past a panel that the world's own renderer shows, driven by the world's own car; and how much of the surrogate's excess is left,
-of the gradient's searches and of random ones that are strong in the surrogate.
+of the gradient's searches and of random ones that are strong in the surrogate. Of a set that claims something about a kind of place: how many more
+drives leave the lane past the gradient's panels, over places and victims.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from benchmarks.results import REPOSITORY, LedgerRow
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 _LEAST = 0.25
+# Smallest difference of the shares of drives off the lane, and its smallest lower bound [percentage points].
+_POINTS, _LOW_POINTS = 50.0, 30.0
 # The target is for worlds that this project did not write.
 _FOREIGN = ("gap_metadrive", "gap_metadrive_unseen", "gap_duckietown", "gap_duckietown_robust")
 
@@ -41,6 +44,8 @@ def ledger_rows(names: str) -> list[LedgerRow]:
     if len(tests) > 1:
         return all_luck_rows([(name, data["primary"][-1]) for name, data in tests])
     ((name, data),) = tests
+    if claims := data.get("claims"):
+        return [row for claim in claims for row in place_rows(name, claim)]
     test = data["primary"][-1]
     registration = read_registration(PUBLISHED / name)
     scenario = registration.scenario(test["test"]["scenario"]) if registration else None
@@ -82,6 +87,30 @@ def gap_rows(
     bound = LedgerRow(f"{name}: gradient minus the strongest random family, deployed natively, lower 95 % bound", round(low, 3), "half lanes per tick", target, met, command, note)  # fmt: skip
     kept = 100.0 * real["excess_m"] / said["excess_m"]
     return [bound, LedgerRow(f"{name}: share of the surrogate's excess that is left, deployed natively", round(kept), "%", "", None, command, f"{said['excess_m']:.3f} to {real['excess_m']:.3f} m per tick")]  # fmt: skip
+
+
+def place_rows(name: str, claim: dict[str, Any]) -> list[LedgerRow]:
+    """How many more drives leave the lane than past the strongest baseline, over the places and victims of a claim; none that cannot be made."""
+    if claim["difference_m"] is None:
+        return []
+    each = ", ".join(
+        f"{one['scenario']} {one['victim']} {one['off_track_points']:+.0f}" for one in claim["each"]
+    )
+    note = (
+        f"{claim['places']} places and {claim['victims']} victims, points: {each}; excess {claim['difference_m']:+.3f} m per tick more "
+        f"(95 % {claim['low_m']:+.3f} to {claim['high_m']:+.3f})"
+    )
+    what = f"{name}: drives off the lane, gradient minus the strongest baseline, deployed natively"
+    points, low, command = (
+        claim["off_track_points"],
+        claim["low_off_track_points"],
+        f"python -m benchmarks.gap {name}",
+    )
+    rows = [LedgerRow(what, round(points), "points", f">= {_POINTS:g}", points >= _POINTS, command, note)]
+    if low is not None:
+        bound, target = f"{what}, lower 95 % bound", f"> {_LOW_POINTS:g}"
+        rows.append(LedgerRow(bound, round(low), "points", target, low > _LOW_POINTS, command, note))
+    return rows
 
 
 def luck_row(name: str, test: dict[str, Any]) -> LedgerRow:

@@ -153,7 +153,9 @@ class DriveLog:
         if not self.rate_hz:
             return "times that go back or repeat"
         digits = ",.0f" if self.rate_hz >= 1000.0 else ".3g"
-        return f"{self.rate_hz:{digits}} Hz" + (": times in another unit" if self.rate_hz > FASTEST_HZ else "")
+        return f"{self.rate_hz:{digits}} Hz" + (
+            ": times in another unit" if self.rate_hz > FASTEST_HZ else ""
+        )
 
     def first_image(self) -> Rgb:
         """The first image.

@@ -278,9 +278,11 @@ def _place_claim(row: Mapping[str, Any]) -> str:
     title = f"**{row['name']}**, {style_of(row['method']).title} minus the strongest baseline, {row['places']} places and {row['victims']} victims"
     if row["difference_m"] is None:
         return f"{title}: no claim, as {row['reason']}.\n"
+    low = row["low_off_track_points"]
     said = (
         f"{title}: {row['difference_m']:+.3f} m per tick ({ends(row['low_m'], row['high_m'])} for new places and victims), off track "
-        f"{row['off_track_points']:+.0f} points, at least {row['least_off_track_points']:+.0f} at each place.\n"
+        f"{row['off_track_points']:+.0f} points ({'no bound, as all are equal' if low is None else f'lower bound {low:+.0f}'}), "
+        f"at least {row['least_off_track_points']:+.0f} at each place.\n"
     )
     return f"{said}\n" + _lines(
         [

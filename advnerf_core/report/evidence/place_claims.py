@@ -47,7 +47,9 @@ class PlaceClaimRow:
         low_m: Lower end of its interval over new places and new victims [m].
         high_m: Upper end [m].
         off_track_points: Mean difference of the shares of drives off the track [percentage points].
-        least_off_track_points: The smallest of these differences: shares without spread give no interval.
+        low_off_track_points: Lower end of its interval over new places and new victims; None if all are equal, as values without spread
+            give no interval.
+        least_off_track_points: The smallest of these differences.
         places: Number of places.
         victims: Number of victims.
         each: The values that the means are of.
@@ -62,6 +64,7 @@ class PlaceClaimRow:
     low_m: float | None = None
     high_m: float | None = None
     off_track_points: float | None = None
+    low_off_track_points: float | None = None
     least_off_track_points: float | None = None
     each: tuple[dict[str, Any], ...] = ()
     reason: str = ""
@@ -85,15 +88,21 @@ def place_claim_row(evidence: Evidence, claim: PlaceClaim) -> PlaceClaimRow:
         for scenario in claim.scenarios
         for victim in claim.victims
     ]
-    values_m = np.reshape([one.difference_m for one in each], shape)
-    interval = clustered_interval(list(values_m), evidence.registration.level)
+    values_m, points = (
+        np.reshape([getattr(one, name) for one in each], shape)
+        for name in ("difference_m", "off_track_points")
+    )
+    interval, of_points = (
+        clustered_interval(list(values), evidence.registration.level) for values in (values_m, points)
+    )
     assert interval is not None, "a claim has several places and victims"
-    points = [one.off_track_points for one in each]
+    assert of_points is not None, "a claim has several places and victims"
     return PlaceClaimRow(
         claim.name,
         claim.method,
         *shape,
-        *(interval.mean, interval.low, interval.high, float(np.mean(points)), min(points)),
+        *(interval.mean, interval.low, interval.high),
+        *(of_points.mean, of_points.low if np.ptp(points) else None, float(points.min())),
         each=tuple(vars(one) for one in each),
     )
 

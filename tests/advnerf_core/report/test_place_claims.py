@@ -18,6 +18,7 @@ from advnerf_core.report.evidence.registration import (
     read_registration,
 )
 from advnerf_core.report.evidence.results import Evidence, as_data
+from benchmarks.gap import place_rows
 from benchmarks.planted_changes import write_simulated_set
 
 PLACES, VICTIMS = ("one", "two", "three", "four"), ("hardened", "other")
@@ -78,6 +79,23 @@ def test_the_interval_is_over_places_and_victims(folder: Any) -> None:
     half = stdtrit(3, 0.975) * values.mean(axis=1).std(ddof=1) / 2.0
     assert (row.low_m, row.high_m) == pytest.approx((values.mean() - half, values.mean() + half))
     assert row.least_off_track_points == 0.0 < row.off_track_points
+    points = np.reshape([each["off_track_points"] for each in row.each], (4, 2)).mean(axis=1)
+    assert row.low_off_track_points == pytest.approx(
+        points.mean() - stdtrit(3, 0.975) * points.std(ddof=1) / 2.0
+    )
+    difference, bound = place_rows("roads", vars(row))
+    assert (difference.value, bound.value) == (
+        round(row.off_track_points),
+        round(row.low_off_track_points or 0.0),
+    )
+    assert (difference.met, bound.met) == (row.off_track_points >= 50.0, False)
+
+
+def test_equal_shares_of_drives_have_a_mean_and_no_bound(folder: Any) -> None:
+    row = place_claim_row(at_places(folder, set()), CLAIM)
+    assert row.off_track_points == row.least_off_track_points
+    assert row.low_off_track_points is None
+    assert len(place_rows("roads", vars(row))) == 1
 
 
 def test_many_searches_make_no_narrower_interval(folder: Any) -> None:
