@@ -13,6 +13,7 @@ from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.declaration import find_declaration
 from advnerf_core.policies.frames import FrameStack
+from advnerf_core.policies.load import wrong_policy
 from advnerf_core.policies.memory import NetworkState
 from advnerf_core.policies.tensors import FLOATS, UINT8, TensorInfo
 from advnerf_core.policies.tracker import TrackedTrajectory
@@ -77,7 +78,7 @@ def tensors_of(path: Path) -> tuple[list[TensorInfo], list[TensorInfo], str | No
 
         program, _, embedded = opened_program(path)
         return *program_tensors(program), embedded
-    raise PolicyContractError(f"expected a file of .safetensors, .onnx or .pt2, got {path}")
+    raise PolicyContractError(wrong_policy(path))
 
 
 def _guessed(

@@ -31,6 +31,20 @@ if TYPE_CHECKING:
 _FACTORY = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".pt2")
 _ADDRESS = re.compile(r"grpcs?://")
+# What makes a policy of files that people have first.
+_OTHER_FILES = {
+    (
+        ".pt",
+        ".pth",
+        ".ckpt",
+        ".bin",
+        ".pkl",
+    ): "such files run code when they are opened: write a .pt2 with torch.export.save or a .onnx with "
+    "torch.onnx.export, or load it in a factory that you trust",
+    (".h5", ".keras", ".pb", ".tflite"): "convert it with tf2onnx",
+    (".engine", ".trt", ".plan"): "it is for one GPU: give the .onnx that it was built from",
+    (".py",): "name a function in it: package.module:factory",
+}
 _CODE_OF_MODULES: WeakKeyDictionary[ModuleType, str] = WeakKeyDictionary()
 
 
@@ -47,6 +61,18 @@ def is_code(spec: str | os.PathLike[str]) -> bool:
 def is_address(spec: str | os.PathLike[str]) -> bool:
     """Whether a policy is named as the address of a driver: ``grpc://HOST:PORT``, or ``grpcs://`` by TLS."""
     return _ADDRESS.match(str(spec)) is not None
+
+
+def wrong_policy(spec: str | os.PathLike[str]) -> str:
+    """What to say of a name that is none of a policy, or of a file that is not there."""
+    path = Path(spec)
+    ending = path.suffix.lower()
+    advice = next(
+        (f"; {what}" for endings, what in _OTHER_FILES.items() if ending in endings), "; correct the name"
+    )
+    if ending in POLICY_SUFFIXES:
+        advice = ", which is not there" if path.suffix == ending else "; write its ending in small letters"
+    return f"expected a policy file ({', '.join(POLICY_SUFFIXES)}), package.module:factory or grpc://HOST:PORT, got {spec}{advice}"
 
 
 def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = None) -> LoadedPolicy:
@@ -102,9 +128,7 @@ def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
         return AdaptedPolicy(
             loaded.policy, PolicyContract(loaded.view, goal_size=loaded.policy.goal_size)
         ), loaded.sha256
-    raise PolicyContractError(
-        f"expected a file of {', '.join(POLICY_SUFFIXES)} or package.module:factory, got {spec}"
-    )
+    raise PolicyContractError(wrong_policy(spec))
 
 
 def described_policy(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str, dict[str, str]]:

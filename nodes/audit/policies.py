@@ -17,7 +17,7 @@ from advnerf_core.inputs import InputFiles
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.declaration import DECLARATION_SUFFIX
 from advnerf_core.policies.guess import Question, guess_contract
-from advnerf_core.policies.load import is_address, is_code, load_any_policy
+from advnerf_core.policies.load import is_address, is_code, load_any_policy, wrong_policy
 from advnerf_core.policies.onnx_policy import read_onnx
 from nodes.runtime.errors import ConfigError
 
@@ -51,9 +51,7 @@ def resolve_policy(
         return given, load_any_policy(given).view.camera
     file = Path(given)
     if not file.is_file():
-        raise ConfigError(
-            f"expected a policy file, package.module:factory or grpc://HOST:PORT, got {given}, which is not there"
-        )
+        raise ConfigError(wrong_policy(given))
     contract, questions = guess_contract(file)
     if questions or declared:
         contract = _completed(contract, questions, _read(declared), driven, say)

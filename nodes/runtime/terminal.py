@@ -48,13 +48,10 @@ def experiment_argument(text: str | Path) -> Path:
 
 def policy_argument(text: str) -> str:
     """Name of a policy: a file, which must be there, or a factory. It is checked here, as loading one takes seconds."""
-    if text.endswith(_POLICY_FILES):
-        if not Path(text).is_file():
-            raise typer.BadParameter(f"expected a policy file at {text}, found none; correct the path")
-    elif ":" not in text:
-        raise typer.BadParameter(
-            f"expected a file of {', '.join(_POLICY_FILES)}, or package.module:factory, got {text}"
-        )
+    if not (Path(text).is_file() if text.endswith(_POLICY_FILES) else ":" in text):
+        from advnerf_core.policies.load import wrong_policy
+
+        raise typer.BadParameter(wrong_policy(text))
     return text
 
 

@@ -14,7 +14,7 @@ from pydantic import (
     model_validator,
 )
 
-from advnerf_core.policies.load import POLICY_SUFFIXES, is_code
+from advnerf_core.policies.load import POLICY_SUFFIXES, is_code, wrong_policy
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan.numbers import Count
 from nodes.experiment.plan.sections import PolicyConfig
@@ -33,10 +33,7 @@ def _located(spec: str, info: ValidationInfo) -> str:
         return spec
     file = beside(spec, info)
     if file.suffix not in POLICY_SUFFIXES or not file.is_file():
-        wrong = "which is not there" if file.suffix in POLICY_SUFFIXES else "which is none of these"
-        raise refusal(
-            f"expected a policy file ({', '.join(POLICY_SUFFIXES)}) relative to this file, package.module:factory or grpc://HOST:PORT, got {spec}, {wrong}"
-        )
+        raise refusal(f"{wrong_policy(spec)} (relative to this file)")
     return str(file.resolve())
 
 

@@ -1,5 +1,6 @@
 import io
 import pickle
+import re
 import sys
 import zipfile
 from dataclasses import replace
@@ -16,6 +17,7 @@ from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.exported_policy import export_program
+from advnerf_core.policies.guess import guess_contract
 from advnerf_core.policies.load import load_adapted, load_any_policy, load_driver
 from advnerf_core.policies.onnx_policy import OnnxNetwork, export_onnx
 from advnerf_core.policies.pilotnet import PilotNet
@@ -264,10 +266,25 @@ def test_a_factory_is_found_frozen_and_named_by_its_content(tmp_path, monkeypatc
         (tmp_path / f"my_broken_{number}.py").write_text(code)
         with pytest.raises(PolicyContractError, match=message):
             load_any_policy(f"my_broken_{number}:factory")
-    with pytest.raises(
-        PolicyContractError, match=r"expected a file of .safetensors, .onnx, .pt2 or package.module:factory"
-    ):
-        load_any_policy("policy.tflite")
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("policy.tflite", "; convert it with tf2onnx"),
+        ("policy.pt", "; such files run code when they are opened: write a .pt2 with torch.export.save or"),
+        ("policy.engine", "; it is for one GPU: give the .onnx"),
+        ("policy.py", "; name a function in it: package.module:factory"),
+        ("POLICY.ONNX", "; write its ending in small letters"),
+        ("policy", "; correct the name"),
+    ],
+)
+def test_files_of_other_kinds_are_told_what_makes_a_policy_of_them(tmp_path, name, advice):
+    (tmp_path / name).touch()
+    told = re.escape(f"{tmp_path / name}{advice}")
+    for reads in (load_any_policy, guess_contract):
+        with pytest.raises(PolicyContractError, match=told):
+            reads(tmp_path / name)
 
 
 def test_our_own_file_is_one_of_them(tmp_path):

@@ -273,7 +273,7 @@ def test_another_policy_under_the_same_name_is_another_cell(folder: Path, tmp_pa
     ("change", "message"),
     [
         ("victims={mine: {policy: no.onnx}}", r"victims\.mine\.policy: expected a policy file.*no\.onnx, which is not there"),
-        ("victims={mine: {policy: my_driver.py}}", r"my_driver\.py, which is none of these"),
+        ("victims={mine: {policy: my_driver.py}}", r"my_driver\.py; name a function in it"),
         ("victims={mine: {}}", r"victims\.mine\.train is missing"),
         ("victims={mine: {policy: my.onnx, train: {}}}", r"unknown key victims\.mine\.train; valid keys here: policy"),
         ("victims={retrained: {policy: my.onnx}}", r"other names than retrained"),
