@@ -20,7 +20,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.about import ObjectPlace, read_about
-from advnerf_core.report.evidence.page import above_of, film_of, filmed_of, searched_apart
+from advnerf_core.report.evidence.page import above_of, film_of, filmed_of, maps_of
 from advnerf_core.report.evidence.registration import PrimaryTest
 from advnerf_core.report.evidence.results import Evidence, read_evidence
 from advnerf_core.report.evidence.verifying.layout import SET
@@ -36,13 +36,14 @@ _STILLS_LEFT, _STILLS_BOTTOM, _STILL = (0.545, 0.772), (0.35, 0.645), (0.22, 0.2
 _QUALITIES = (90, 80, 65, 50)
 # Height of a film's captions as a share, and its frames per second.
 _CAPTION, _FILM_HZ, _COLUMNS = 0.2, 5.0, 3
-_MARGIN = 0.13  # left of each of several maps, as a share of its width
+# Left of each of several maps, as a share of its width, and of all of them, as one of the picture's.
+_MARGIN, _LEFT = 0.13, 0.02
 _BEFORE_S = 1.0  # before the key moment, when the object is in sight
 _SPACING = 0.05  # between points along the path, in half lanes
 
 
 @dataclass(frozen=True)
-class _Group:
+class DriveGroup:
     """All deployed drives with one condition of the object.
 
     Attributes:
@@ -65,40 +66,44 @@ class _Group:
 
 
 def write_above_of(folder: Path) -> Path | None:
-    """Write the picture of a published set beside its folder; None if it has no primary test.
+    """Write the picture of a published set beside its folder; None if it has no primary test and no claim.
 
     Of a set whose scenarios share their searches the last one is drawn, with stills of its film; otherwise one map for each.
     """
-    primary = read_json(folder / SET)["primary"]
-    if not primary:
+    data = read_json(folder / SET)
+    maps = maps_of(data)
+    if not maps:
         return None
     about = read_about(folder.parent).get(folder.name)
     film, target = folder.parent / film_of(folder.name), folder.parent / above_of(folder.name)
     evidence = read_evidence(folder)
-    shown = searched_apart(primary)
-    if len(shown) > 1:
-        return write_maps(evidence, shown, target)
-    return write_above(
-        evidence, primary[-1], filmed_of(primary), about.object if about else None, film, target
-    )
+    if len(maps) > 1:
+        return write_maps(evidence, maps, target)
+    place = about.object if about else None
+    return write_above(evidence, data["primary"][-1], filmed_of(data), place, film, target)
 
 
-def write_maps(evidence: Evidence, shown: Sequence[Mapping[str, Any]], target: Path) -> Path:
-    """Write a picture with one map for each of some primary tests from ``set.json``, and below it the deviation over time."""
+def write_maps(evidence: Evidence, maps: Sequence[Sequence[Mapping[str, Any]]], target: Path) -> Path:
+    """Write a picture with one map for each of `maps_of`, and below it the deviation over time."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor="white")
-        for number, each in enumerate(shown):
-            test = PrimaryTest.model_validate(each["test"])
-            groups = _groups(evidence, test, each["baseline"])
+        for number, shown in enumerate(maps):
+            test = PrimaryTest.model_validate(shown[0]["test"])
+            groups = groups_of_drives(evidence, shown)
             registered = evidence.registration.scenario(test.scenario, test.placement)
             assert registered is not None, "the test was registered"
-            left, width = (number + _MARGIN) / len(shown), (1.0 - 1.2 * _MARGIN) / len(shown)
+            share = (1.0 - _LEFT) / len(maps)
+            left, width = _LEFT + (number + _MARGIN) * share, (1.0 - 1.2 * _MARGIN) * share
             ax = figure.add_axes((left, 0.36, width, 0.46))
             _draw_map(ax, groups, registered.reference_path(), registered.off_track_m, None)
             ax.set_title(" ".join(filter(None, (test.scenario, test.placement))).replace("_", " "), pad=60)
             ax.legend(handles=_handles(groups), loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
-            ax = figure.add_axes((left, 0.085, width, 0.15))
-            _draw_deviation(ax, groups, registered.off_track_m, registered.dt_s)
+            below = figure.add_axes((left, 0.085, width, 0.15))
+            _draw_deviation(below, groups, registered.off_track_m, registered.dt_s)
+            if number:  # said once for the row
+                below.set_title("")
+                for each in (ax, below):
+                    each.set_ylabel("")
     write_atomically(target, _webp(figure))
     return target
 
@@ -116,7 +121,7 @@ def write_above(
     Both are primary tests from ``set.json``. Without the position of the object, or without a film, the picture lacks these.
     """
     test = PrimaryTest.model_validate(shown["test"])
-    groups = _groups(evidence, test, shown["baseline"])
+    groups = groups_of_drives(evidence, [shown])
     registered = evidence.registration.scenario(test.scenario, test.placement)
     assert registered is not None, "the test was registered"
     with matplotlib.rc_context(STYLE):
@@ -139,23 +144,42 @@ def moment_of(evidence: Evidence, test: PrimaryTest) -> tuple[float, bool]:
     return (largest + 1) * evidence.scenario_of(cell).dt_s, False
 
 
-def _groups(evidence: Evidence, test: PrimaryTest, baseline: str) -> list[_Group]:
+def groups_of_drives(evidence: Evidence, shown: Sequence[Mapping[str, Any]]) -> list[DriveGroup]:
+    """Drives past the plain object, the strongest baseline and the attack, of all victims."""
+    tests = [PrimaryTest.model_validate(each["test"]) for each in shown]
+    baselines = [str(each["baseline"]) for each in shown]
+    strongest = style_of(baselines[0]).title if len(set(baselines)) == 1 else "strongest baseline"
     # Three fixed colours of different lightness, for any method.
-    colours = {NONE: LIGHT[NONE], baseline: LIGHT["random"], test.method: LIGHT["gradient"]}
-    found = []
-    for method, colour in colours.items():
-        cells = evidence.searches((test.scenario, test.placement, test.victim, method))
-        metrics = [each for cell in cells for each in evidence.metrics(cell, "deployed")]
-        poses = [drive.poses() for cell in cells for drive in cell.kept["deployed"]]
-        off = sum(each.off_track for each in metrics)
-        hit = sum(each is not None for cell in cells for each in cell.obstacles("deployed"))
-        ctes_m = [np.array(each.ctes_m) for each in metrics]
-        found.append(_Group(style_of(method).title, colour, poses, ctes_m, off, hit))
-    return found
+    return [
+        _group(evidence, style_of(NONE).title, LIGHT[NONE], tests, [NONE] * len(tests)),
+        _group(evidence, strongest, LIGHT["random"], tests, baselines),
+        _group(
+            evidence,
+            style_of(tests[0].method).title,
+            LIGHT["gradient"],
+            tests,
+            [each.method for each in tests],
+        ),
+    ]
+
+
+def _group(
+    evidence: Evidence, title: str, colour: str, tests: Sequence[PrimaryTest], methods: Sequence[str]
+) -> DriveGroup:
+    cells = [
+        cell
+        for test, method in zip(tests, methods, strict=True)
+        for cell in evidence.searches((test.scenario, test.placement, test.victim, method))
+    ]
+    metrics = [each for cell in cells for each in evidence.metrics(cell, "deployed")]
+    poses = [drive.poses() for cell in cells for drive in cell.kept["deployed"]]
+    off = sum(each.off_track for each in metrics)
+    hit = sum(each is not None for cell in cells for each in cell.obstacles("deployed"))
+    return DriveGroup(title, colour, poses, [np.array(each.ctes_m) for each in metrics], off, hit)
 
 
 def _draw_map(
-    ax: Any, groups: Sequence[_Group], path: Any, off_track_m: float, place: ObjectPlace | None
+    ax: Any, groups: Sequence[DriveGroup], path: Any, off_track_m: float, place: ObjectPlace | None
 ) -> None:
     along = np.asarray(path.pose_at(np.arange(0.0, path.length_m, _SPACING * off_track_m)))
     across = np.stack([-np.sin(along[:, 2]), np.cos(along[:, 2])], axis=1)
@@ -191,7 +215,7 @@ def _in_shape(low: Floats, high: Floats, shape: float) -> tuple[Floats, Floats]:
     return middle - 0.5 * size, middle + 0.5 * size
 
 
-def _width(group: _Group) -> float:
+def _width(group: DriveGroup) -> float:
     """Thinner lines for more drives."""
     return 1.2 if len(group.poses) <= 20 else 0.6
 
@@ -213,7 +237,7 @@ def _draw_object(ax: Any, place: ObjectPlace) -> Floats:
     return middle
 
 
-def _draw_deviation(ax: Any, groups: Sequence[_Group], off_track_m: float, dt_s: float) -> None:
+def _draw_deviation(ax: Any, groups: Sequence[DriveGroup], off_track_m: float, dt_s: float) -> None:
     for side in (-off_track_m, off_track_m):
         ax.axhline(side, color=LIGHT["muted"], lw=1.1, zorder=1)
     ax.axhline(0.0, color=LIGHT["grid"], lw=1.1, zorder=1)
@@ -256,11 +280,11 @@ def _frame_at(film: Path, when_s: float) -> list[NDArray[np.uint8]]:
     return [frame[top:, begin + 1 : end - 1] for begin, end in pairwise(edges)]
 
 
-def _handles(groups: Sequence[_Group]) -> list[Line2D]:
+def _handles(groups: Sequence[DriveGroup]) -> list[Line2D]:
     return [Line2D([], [], color=group.colour, lw=2.2, label=group.label) for group in groups]
 
 
-def _add_legend(figure: Figure, groups: Sequence[_Group], place: ObjectPlace | None) -> None:
+def _add_legend(figure: Figure, groups: Sequence[DriveGroup], place: ObjectPlace | None) -> None:
     handles = _handles(groups)
     handles.append(Line2D([], [], color=LIGHT["muted"], lw=1.1, label="edge of the track"))
     if place is not None:

@@ -133,7 +133,7 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
     if data["filmed"]:
         parts.append(
             f"![Drives past the plain object, the strongest baseline and the attack]({film_of(name)})\n\n"
-            f"*Film: {place_of(filmed_of(data['primary'])['test'])}.*\n"
+            f"*Film: {_filmed(data)}.*\n"
         )
     if data.get("contrasts"):
         parts += ["### What each difference costs\n", _contrasts(data["contrasts"])]
@@ -155,18 +155,38 @@ def searched_apart(primary: Sequence[Mapping[str, Any]]) -> list[Mapping[str, An
     )
 
 
-def filmed_of(primary: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """The primary test from ``set.json`` whose drives are filmed: the first one; of scenarios with searches of their own the one with the largest difference."""
-    apart = searched_apart(primary)
-    return max(apart, key=lambda test: test["difference_m"] or 0.0) if len(apart) > 1 else primary[0]
+def maps_of(data: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
+    """The maps in the picture of a set by its ``set.json``, each with the tests whose drives it shows: one for each of `searched_apart`, and for each
+    place of a claim one of all victims; none without tests and claims."""
+    if data["primary"]:
+        return [[test] for test in searched_apart(data["primary"])]
+    maps = dict[str, list[Mapping[str, Any]]]()
+    for claimed in data.get("claims", ()):
+        for each in claimed["each"]:
+            which = {"scenario": each["scenario"], "victim": each["victim"], "method": claimed["method"]}
+            test = {"placement": "", "against": [each["baseline"]], **which}
+            maps.setdefault(each["scenario"], []).append({**each, "test": test})
+    return list(maps.values())
+
+
+def filmed_of(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The test from ``set.json`` whose drives are filmed: the first one; of scenarios with searches of their own the one with the largest difference."""
+    apart = [test for tests in maps_of(data) for test in tests]
+    return max(apart, key=lambda test: test["difference_m"] or 0.0) if len(apart) > 1 else data["primary"][0]
+
+
+def _filmed(data: Mapping[str, Any]) -> str:
+    test = filmed_of(data)["test"]
+    return place_of(test) + ("" if data["primary"] else f", victim {test['victim']}")
 
 
 def _picture(name: str, data: Mapping[str, Any]) -> list[str]:
-    if not data["primary"]:
+    maps = maps_of(data)
+    if not maps:
         return []
-    if len(searched_apart(data["primary"])) > 1:
+    if len(maps) > 1:
         return [f"![All deployed drives of each scenario from above]({above_of(name)})\n"]
-    shown, filmed = (place_of(each["test"]) for each in (data["primary"][-1], filmed_of(data["primary"])))
+    shown, filmed = (place_of(each["test"]) for each in (data["primary"][-1], filmed_of(data)))
     stills = f" Stills: {filmed}." if data["filmed"] else ""
     place = (data.get("about") or {}).get("object")
     stands = (

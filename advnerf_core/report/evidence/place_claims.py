@@ -47,8 +47,8 @@ class PlaceClaimRow:
         low_m: Lower end of its interval over new places and new victims [m].
         high_m: Upper end [m].
         off_track_points: Mean difference of the shares of drives off the track [percentage points].
-        low_off_track_points: Lower end of its interval over new places and new victims; None if all are equal, as values without spread
-            give no interval.
+        low_off_track_points: Lower end of its interval over new places and new victims, at least -100; None if all are equal, as values
+            without spread give no interval.
         least_off_track_points: The smallest of these differences.
         places: Number of places.
         victims: Number of victims.
@@ -102,7 +102,7 @@ def place_claim_row(evidence: Evidence, claim: PlaceClaim) -> PlaceClaimRow:
         claim.method,
         *shape,
         *(interval.mean, interval.low, interval.high),
-        *(of_points.mean, of_points.low if np.ptp(points) else None, float(points.min())),
+        *(of_points.mean, max(of_points.low, -100.0) if np.ptp(points) else None, float(points.min())),
         each=tuple(vars(one) for one in each),
     )
 

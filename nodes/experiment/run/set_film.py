@@ -14,7 +14,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.clips import read_clip, webp
 from advnerf_core.report.conditions import NONE
-from advnerf_core.report.evidence.page import film_of, filmed_of
+from advnerf_core.report.evidence.page import film_of, filmed_of, maps_of
 from advnerf_core.report.evidence.results import read_evidence
 from advnerf_core.report.evidence.verifying.layout import SET
 from nodes.experiment.show.context import Experiment
@@ -25,9 +25,9 @@ _EVERY = 2  # frames, at ten frames a second
 
 
 def write_film(experiment: Experiment, published: Path) -> Path | None:
-    """Write the film of a primary test (`filmed_of`) beside the page; None without a test, or if a clip is not on this machine."""
-    primary = read_json(published / SET)["primary"]
-    clips = _clips(experiment, published, filmed_of(primary)) if primary else []
+    """Write the film of `filmed_of` beside the page; None without a test or claim, or if a clip is not on this machine."""
+    data = read_json(published / SET)
+    clips = _clips(experiment, published, filmed_of(data)) if maps_of(data) else []
     if not clips or not all(clip.exists() for clip in clips):
         return None
     frames = _side_by_side([read_clip(clip)[::_EVERY] for clip in clips])

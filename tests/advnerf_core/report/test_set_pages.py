@@ -11,8 +11,14 @@ from PIL import Image
 from advnerf_core.errors import ConfigError
 from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.about import ABOUT, check_about, read_about
-from advnerf_core.report.evidence.above import MOST_BYTES, moment_of, write_above_of, write_maps
-from advnerf_core.report.evidence.page import above_of, film_of, groups_of_searches, searched_apart
+from advnerf_core.report.evidence.above import (
+    MOST_BYTES,
+    groups_of_drives,
+    moment_of,
+    write_above_of,
+    write_maps,
+)
+from advnerf_core.report.evidence.page import above_of, film_of, groups_of_searches, maps_of, searched_apart
 from advnerf_core.report.evidence.registration import PrimaryTest, SetError
 from advnerf_core.report.evidence.results import read_evidence, rows
 from advnerf_core.report.evidence.verify import verify_beside, verify_set
@@ -37,8 +43,9 @@ def published(name):
 @pytest.mark.parametrize("name", SETS)
 def test_every_set_shows_its_drives_from_above_and_what_the_camera_saw(name):
     text, picture = section(name), PUBLISHED / above_of(name)
-    several = len(searched_apart(published(name)["primary"])) > 1
-    assert several == name.startswith("paper_")  # the scenarios of other sets share their searches
+    several = len(maps_of(published(name))) > 1
+    # The scenarios of other sets share their searches.
+    assert several == name.startswith(("paper_", "metadrive_billboard"))
     what = "of each scenario from above" if several else "from above, and what the camera saw"
     assert text.lstrip().startswith(f"![All deployed drives {what}]({picture.name})")
     assert picture.stat().st_size <= MOST_BYTES == 250_000
@@ -53,7 +60,7 @@ def test_every_set_shows_both_controls_and_the_sentence_uses_the_smaller_excess(
     assert "| over no object |" in text
     missing = [row["method"] for row in data["rows"] if row["over_no_object_m"] is None]
     assert text.count("| not driven |") == len([method for method in missing if method != "empty"])
-    apart = searched_apart(data["primary"])
+    apart = searched_apart(data["primary"]) if data["primary"] else []
     for test in apart if len(apart) > 1 else data["primary"][-1:]:
         (row,) = [
             each
@@ -217,13 +224,36 @@ def test_a_set_without_a_film_and_a_known_object_has_its_drives_from_above(tmp_p
 def test_scenarios_with_searches_of_their_own_have_a_map_each(tmp_path):
     folder = PUBLISHED / "paper_car"
     evidence = read_evidence(folder)
-    shown = searched_apart(published("paper_car")["primary"])
-    picture = np.asarray(Image.open(write_maps(evidence, shown, tmp_path / "maps.webp")).convert("RGB"))
+    maps = maps_of(published("paper_car"))
+    picture = np.asarray(Image.open(write_maps(evidence, maps, tmp_path / "maps.webp")).convert("RGB"))
     halves = np.split(picture.astype(int), 2, axis=1)
     for half in halves:
         for colour in ((0x00, 0x72, 0xB2), (0xDD, 0x93, 0x00), (0xB0, 0x12, 0x3C)):
             assert (np.abs(half - colour).max(axis=-1) < 40).sum() > 100
     assert (np.abs(halves[0] - halves[1]).max(axis=-1) > 40).sum() > 1000  # each of its own drives
+
+
+def test_each_place_of_a_claim_has_a_map_of_all_its_victims():
+    data = published("metadrive_billboard")
+    maps = maps_of(data)
+    assert [{each["test"]["scenario"] for each in tests} for tests in maps] == [
+        {"cx"},
+        {"ct"},
+        {"sxs"},
+        {"sts"},
+    ]
+    assert all([each["test"]["victim"] for each in tests] == ["first", "second"] for tests in maps)
+    evidence = read_evidence(PUBLISHED / "metadrive_billboard")
+    for tests in maps:
+        plain, baseline, attack = groups_of_drives(evidence, tests)
+        assert len(plain.poses) == len(baseline.poses) == len(attack.poses) == 2 * 5
+        rows = [
+            row
+            for row in data["rows"]
+            if (row["domain"], row["method"], row["scenario"])
+            == ("deployed", "gradient", tests[0]["scenario"])
+        ]
+        assert attack.off_track == sum(row["off_track"] for row in rows)
 
 
 FORBIDDEN = ("the real place", "the real car", "learned copy", "no attack", "7 of 7 registered")

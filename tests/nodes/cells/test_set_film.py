@@ -40,6 +40,12 @@ def test_of_scenarios_with_searches_of_their_own_the_largest_difference_is_filme
         return {"test": test, "searches": searches, "difference_m": difference_m}
 
     apart = [primary("straight", 0.1, 0.1), primary("right", 0.2, 3.0), primary("left", 0.3, None)]
-    assert filmed_of(apart) == apart[1]
+    assert filmed_of({"primary": apart}) == apart[1]
     shared = [primary("composed", 0.1, 0.1), primary("native", 0.1, 3.0)]
-    assert filmed_of(shared) == shared[0]
+    assert filmed_of({"primary": shared}) == shared[0]
+    each = [
+        {"scenario": place, "victim": victim, "baseline": "cem", "difference_m": difference_m}
+        for place, victim, difference_m in (("cx", "a", 0.1), ("cx", "b", 2.0), ("ct", "a", 1.0))
+    ]
+    claimed = filmed_of({"primary": [], "claims": [{"method": "gradient", "each": each}]})
+    assert (claimed["test"]["scenario"], claimed["test"]["victim"]) == ("cx", "b")
