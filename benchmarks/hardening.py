@@ -12,6 +12,7 @@ from pathlib import Path
 from advnerf_core.report.evidence.verifying.layout import complete_sets
 from benchmarks.results import record_row
 from benchmarks.strongest import Strongest, strongest_random
+from nodes.experiment.plan.victims import HARDENED
 
 PUBLISHED = Path("docs/results")
 
@@ -20,7 +21,7 @@ def main() -> None:
     """Judge the victim of a run folder, or read the published sets."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, nargs="?", help="run folder; without one: the published sets")
-    parser.add_argument("--victim", default="hardened")
+    parser.add_argument("--victim", default=HARDENED)
     parser.add_argument(
         "--textures", type=int, default=0, help="of each family; 0: as many as a search evaluates"
     )
@@ -66,7 +67,8 @@ def _judge(run: Path, victim: str, textures: int) -> None:
 
 
 def _record_published(name: str, found: Strongest) -> None:
-    place = " ".join(filter(None, (found.scenario, found.placement))).replace("_", " ")
+    victim = "" if found.victim == HARDENED else found.victim
+    place = " ".join(filter(None, (found.scenario, found.placement, victim))).replace("_", " ")
     for domain, reached in (("learned scene", found.surrogate), ("deployed", found.deployed)):
         print(f"{name}, {place}, {domain}: {found.how}: {reached.text}")
         record_row(

@@ -78,7 +78,8 @@ class Strongest:
     @property
     def how(self) -> str:
         """Settings of the searches, as text."""
-        return f"{style_of(self.method).title}, {self.searches} searches, each the best of {self.evaluations} textures"
+        searches = "one search," if self.searches == 1 else f"{self.searches} searches, each"
+        return f"{style_of(self.method).title}, {searches} the best of {self.evaluations} textures"
 
 
 def strongest_random(folder: Path) -> list[Strongest]:
