@@ -154,7 +154,19 @@ def _transfers(sets: Sequence[Mapping[str, Any]], about: Mapping[str, SetAbout])
         f"{_counts(sets, about)} In {moved} of {len(pairs)} comparisons the deployed attack moves the car further from its path than the controls do "
         f"(95 % interval above zero), by {min(each.mean_m for each in smaller):.3f} to {max(each.mean_m for each in smaller):.3f} m per tick over the "
         f"control that leaves less; {lacking} have no drives with no object. Of this excess in the learned scene, {100 * min(kept):.0f} to "
-        f"{100 * max(kept):.0f} % is left."
+        f"{100 * max(kept):.0f} % is left.{_claimed(sets)}"
+    )
+
+
+def _claimed(sets: Sequence[Mapping[str, Any]]) -> str:
+    """What claims over places and victims say, also where the attack does nothing."""
+    return "".join(
+        f" Over {claim['places']} places and {claim['victims']} victims of {found['name']} it adds {claim['difference_m']:+.3f} m per tick to the strongest baseline "
+        f"(95 % {ends(claim['low_m'], claim['high_m'])}); more drives leave the lane at {sum(each['off_track_points'] > 0.0 for each in claim['each'])} "
+        f"of {len(claim['each'])}."
+        for found in sets
+        for claim in found.get("claims", ())
+        if claim["difference_m"] is not None
     )
 
 

@@ -56,6 +56,10 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     # Scenarios with searches of their own are told one by one.
     assert "0 of 120; 120 run into something" in everywhere
     assert everywhere.count("[paper_car]") == 2
+    # A claim about places is told too, with the places where nothing was found.
+    (transfers,) = [each.text for each in answers([], published) if each.question == "Does it transfer?"]
+    assert "4 places and 2 victims of metadrive_billboard it adds +0.487 m per tick" in transfers
+    assert "more drives leave the lane at 2 of 8." in transfers
     # Nothing is claimed that was not measured.
     assert "How fast?" not in found
     assert answers([], tmp_path / "none") == []

@@ -79,8 +79,12 @@ def test_every_set_says_what_it_is_for_and_its_p_values(name):
     assert re.search(
         r"^\*\*(Exploration|Confirmation)\*\*, registered after .+ What changed: ", text, re.MULTILINE
     )
-    assert "p deployed, after Holm" in text
-    assert "| in the learned scene | p there, not adjusted |" in text
+    claims = data.get("claims", ())
+    assert bool(data["primary"]) != bool(claims)
+    for each in claims:
+        assert f"({each['low_m']:.3f} to {each['high_m']:.3f} for new places and victims)" in text
+    assert ("p deployed, after Holm" in text) != bool(claims)
+    assert ("| in the learned scene | p there, not adjusted |" in text) != bool(claims)
     for test in data["primary"]:
         assert test["p_surrogate"] is None or f"| {p_text(test['p_surrogate'])} |" in text
 
