@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Literal
 
 from advnerf_core.plain import PlainData
@@ -82,6 +83,30 @@ class ReferencePath(PlainData):
             if left <= 0.0:
                 break
         return x, y, math.remainder(yaw, 2.0 * math.pi)
+
+    def stretch(self, from_m: float, length_m: float) -> ReferencePath:
+        """A part of this path as an open one; that of a closed path may pass its start.
+
+        Raises:
+            ValueError: An open path ends within it, or the length is not positive.
+        """
+        if length_m <= 0.0 or from_m < 0.0 or (not self.closed and from_m + length_m > self.length_m):
+            raise ValueError(
+                f"expected a stretch of a path of {self.length_m:.2f} m, got {length_m:g} m from {from_m:g} m"
+            )
+        pieces: list[Segment] = []
+        at_m = -(from_m % self.length_m if self.closed else from_m)
+        for segment in cycle(self.segments):
+            piece_m = segment_length_m(segment)
+            begin_m, end_m = max(at_m, 0.0), min(at_m + piece_m, length_m)
+            if end_m > begin_m:
+                share_m = end_m - begin_m
+                angle_rad = 0.0 if segment[0] == "line" else math.copysign(share_m / segment[1], segment[2])
+                pieces.append(("line", share_m) if segment[0] == "line" else ("arc", segment[1], angle_rad))
+            at_m += piece_m
+            if at_m >= length_m:
+                break
+        return ReferencePath(self.pose_at(from_m), tuple(pieces), self.goal)
 
     def mirrored(self, across: Literal["x", "y"]) -> ReferencePath:
         """The same drive mirrored at the x or the y axis of the world: left and right of the axis are swapped."""

@@ -24,6 +24,20 @@ class RobotConfig(StrictModel):
     max_turn_rate_radps: float = Field(default=3.6, gt=0.0, le=4.3)
 
 
+class StretchConfig(StrictModel):
+    """The driven part of one closed route, instead of all routes: photographs and learned box keep to it.
+
+    Attributes:
+        route: Name of the route.
+        from_m: Start of the stretch and of the drives along it [m].
+        length_m: Length of the stretch [m].
+    """
+
+    route: str = "right"
+    from_m: float = Field(default=0.0, ge=0.0)
+    length_m: float = Field(default=3.0, gt=0.5)
+
+
 class DuckietownConfig(StrictModel):
     """The whole world.
 
@@ -31,6 +45,7 @@ class DuckietownConfig(StrictModel):
         map_name: Name of a Duckietown map with a closed route.
         seed: Seed of everything that the map leaves open.
         drives_from_m: Start of the drives along each closed route, in its direction [m].
+        stretch: The only path, an open part of one route; None: all closed routes.
         camera: Driving camera, mounted relative to the middle of the axle; the default is the robot's own.
         photo: Camera of the posed images that a surrogate is learned from.
         robot: The car.
@@ -41,6 +56,7 @@ class DuckietownConfig(StrictModel):
     map_name: str = Field(default="small_loop", min_length=1, pattern=r"^[\w-]+$")
     seed: int = Field(default=3, ge=0)
     drives_from_m: float = Field(default=0.0, ge=0.0)
+    stretch: StretchConfig | None = None
     camera: CameraConfig = CameraConfig(
         x_m=0.066, z_m=0.108, pitch_down_rad=math.radians(19.15), horizontal_fov_deg=107.8
     )

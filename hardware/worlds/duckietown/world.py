@@ -35,13 +35,15 @@ class Duckietown(InstalledWorld):
 
     def __init__(self, config: DuckietownConfig | None = None) -> None:
         self.config = DuckietownConfig() if config is None else config
-        super().__init__("duckietown", self.config, RANGE_M, _LOWEST_M, frozenset({"robot", "drives_from_m"}))
+        super().__init__(
+            "duckietown", self.config, RANGE_M, _LOWEST_M, frozenset({"robot", "drives_from_m", "stretch"})
+        )
 
     def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
-        """The closed routes of the map.
+        """The closed routes of the map, or the stretch of one, and the box about them.
 
         Raises:
-            WorldError: The map has no closed route.
+            WorldError: The map has no closed route, or not the one of the stretch.
         """
         if not facts["ways"]:
             raise WorldError(
@@ -50,24 +52,39 @@ class Duckietown(InstalledWorld):
         lines = np.split(np.asarray(arrays["ways"], dtype=np.float64), np.cumsum(facts["ways"])[:-1])
         robot, (width_m, depth_m) = self.config.robot, facts["size_m"]
         limit = robot.max_turn_rate_radps
+        low, high = (0.0, -float(depth_m)), (float(width_m), 0.0)
+        paths = self._driven(_named(lines))
+        if self.config.stretch is not None:
+            (path,) = paths.values()
+            along = np.array([path.pose_at(s_m)[:2] for s_m in np.linspace(0.0, path.length_m, 100)])
+            low, high = tuple(map(float, along.min(axis=0))), tuple(map(float, along.max(axis=0)))
         return WorldDescription(
-            paths={name: self._begun(path) for name, path in _named(lines).items()},
+            paths=paths,
             off_track_m=_HALF_LANE_TILES * float(facts["tile_m"]),
             car=CarDescription("dubins", robot.speed_mps, (-limit, limit)),
             camera=self.camera_pinhole,
             T_car_from_camera=self.T_car_from_camera,
             box=Box(
-                (-_BESIDE_M, -float(depth_m) - _BESIDE_M, _LOW_M),
-                (float(width_m) + _BESIDE_M, _BESIDE_M, _HIGH_M),
+                (low[0] - _BESIDE_M, low[1] - _BESIDE_M, _LOW_M),
+                (high[0] + _BESIDE_M, high[1] + _BESIDE_M, _HIGH_M),
                 contraction=True,
             ),
             facts={"simulator": str(facts["simulator"])},
         )
 
-    def _begun(self, path: ReferencePath) -> ReferencePath:
-        """The route, with the start of its drives as configured."""
-        begin_m = self.config.drives_from_m
-        return replace(path, drive_from=path.pose_at(begin_m)) if begin_m else path
+    def _driven(self, routes: dict[str, ReferencePath]) -> dict[str, ReferencePath]:
+        """The routes, with the start of their drives as configured, or the stretch of one."""
+        begin_m, stretch = self.config.drives_from_m, self.config.stretch
+        if stretch is None:
+            return {
+                name: replace(path, drive_from=path.pose_at(begin_m)) if begin_m else path
+                for name, path in routes.items()
+            }
+        if stretch.route not in routes:
+            raise WorldError(
+                f"expected stretch.route to be one of {', '.join(routes)} of {self.config.map_name}, got {stretch.route}"
+            )
+        return {stretch.route: routes[stretch.route].stretch(stretch.from_m, stretch.length_m)}
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
         """Poses along, beside and above the routes; see `road_photo_poses`."""
