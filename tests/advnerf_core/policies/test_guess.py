@@ -181,7 +181,7 @@ def test_other_files(tmp_path):
     }
     save_policy(tmp_path / "policy.safetensors", PilotNet(2), VIEW, {})
     assert guess_contract(tmp_path / "policy.safetensors") == (PolicyContract(VIEW, goal_size=2), [])
-    with pytest.raises(PolicyContractError, match=r"expected a file of \.safetensors, \.onnx or \.pt2"):
+    with pytest.raises(PolicyContractError, match=r"expected a policy file \(\.safetensors, \.onnx, \.pt2\)"):
         guess_contract(tmp_path / "policy.tflite")
     with pytest.raises(PolicyContractError, match=r"expected an input of images .*got x \[B, 20\] float32"):
         guess_contract(model(tmp_path, [("x", FLOAT, ["B", 20])], [STEERING]))
