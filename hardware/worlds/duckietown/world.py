@@ -52,12 +52,12 @@ class Duckietown(InstalledWorld):
         lines = np.split(np.asarray(arrays["ways"], dtype=np.float64), np.cumsum(facts["ways"])[:-1])
         robot, (width_m, depth_m) = self.config.robot, facts["size_m"]
         limit = robot.max_turn_rate_radps
-        low, high = (0.0, -float(depth_m)), (float(width_m), 0.0)
+        (low_x_m, low_y_m), (high_x_m, high_y_m) = (0.0, -float(depth_m)), (float(width_m), 0.0)
         paths = self._driven(_named(lines))
         if self.config.stretch is not None:
             (path,) = paths.values()
             along = np.array([path.pose_at(s_m)[:2] for s_m in np.linspace(0.0, path.length_m, 100)])
-            low, high = tuple(map(float, along.min(axis=0))), tuple(map(float, along.max(axis=0)))
+            low_x_m, low_y_m, high_x_m, high_y_m = map(float, (*along.min(axis=0), *along.max(axis=0)))
         return WorldDescription(
             paths=paths,
             off_track_m=_HALF_LANE_TILES * float(facts["tile_m"]),
@@ -65,8 +65,8 @@ class Duckietown(InstalledWorld):
             camera=self.camera_pinhole,
             T_car_from_camera=self.T_car_from_camera,
             box=Box(
-                (low[0] - _BESIDE_M, low[1] - _BESIDE_M, _LOW_M),
-                (high[0] + _BESIDE_M, high[1] + _BESIDE_M, _HIGH_M),
+                (low_x_m - _BESIDE_M, low_y_m - _BESIDE_M, _LOW_M),
+                (high_x_m + _BESIDE_M, high_y_m + _BESIDE_M, _HIGH_M),
                 contraction=True,
             ),
             facts={"simulator": str(facts["simulator"])},
