@@ -11,7 +11,7 @@ from advnerf_core.report.evidence.registration import Registration, read_registr
 BUILD, RECORD = "reference", "stage.json"
 # Stages that are required for driving again.
 _NEEDED = ("scene", "policy")
-LOST = "cannot be driven again: its scene and victim were not kept"
+LOST = "cannot be driven again: its scene or victim was not kept"
 
 
 def is_kept(folder: Path) -> bool:
