@@ -147,7 +147,7 @@ def picture() -> Figure:
             colour, marker = _COLOURS[number % len(_COLOURS)], _MARKERS[number % len(_MARKERS)]
             ax.plot(*each.xy.T, marker, ms=5, mfc="none", color=colour, label=each.name.replace("_", " "))
         ax.set(xlabel="in the learned scene [half lanes per tick]", ylabel="deployed [half lanes per tick]")
-        ax.legend(loc="upper left", fontsize=8)
+        ax.legend(loc="lower right", fontsize=8)
     figure: Figure = ax.figure
     return figure
 

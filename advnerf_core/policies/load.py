@@ -31,19 +31,16 @@ if TYPE_CHECKING:
 _FACTORY = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".pt2")
 _ADDRESS = re.compile(r"grpcs?://")
+_RUNS_CODE = (
+    "such files run code when they are opened: write a .pt2 with torch.export.save or a .onnx with torch.onnx.export, "
+    "or load it in a factory that you trust"
+)
 # What makes a policy of files that people have first.
 _OTHER_FILES = {
-    (
-        ".pt",
-        ".pth",
-        ".ckpt",
-        ".bin",
-        ".pkl",
-    ): "such files run code when they are opened: write a .pt2 with torch.export.save or a .onnx with "
-    "torch.onnx.export, or load it in a factory that you trust",
-    (".h5", ".keras", ".pb", ".tflite"): "convert it with tf2onnx",
-    (".engine", ".trt", ".plan"): "it is for one GPU: give the .onnx that it was built from",
-    (".py",): "name a function in it: package.module:factory",
+    **dict.fromkeys((".pt", ".pth", ".ckpt", ".bin", ".pkl"), _RUNS_CODE),
+    **dict.fromkeys((".h5", ".keras", ".pb", ".tflite"), "convert it with tf2onnx"),
+    **dict.fromkeys((".engine", ".trt", ".plan"), "it is for one GPU: give the .onnx that it was built from"),
+    ".py": "name a function in it: package.module:factory",
 }
 _CODE_OF_MODULES: WeakKeyDictionary[ModuleType, str] = WeakKeyDictionary()
 
@@ -67,9 +64,7 @@ def wrong_policy(spec: str | os.PathLike[str]) -> str:
     """What to say of a name that is none of a policy, or of a file that is not there."""
     path = Path(spec)
     ending = path.suffix.lower()
-    advice = next(
-        (f"; {what}" for endings, what in _OTHER_FILES.items() if ending in endings), "; correct the name"
-    )
+    advice = f"; {_OTHER_FILES.get(ending, 'correct the name')}"
     if ending in POLICY_SUFFIXES:
         advice = ", which is not there" if path.suffix == ending else "; write its ending in small letters"
     return f"expected a policy file ({', '.join(POLICY_SUFFIXES)}), package.module:factory or grpc://HOST:PORT, got {spec}{advice}"

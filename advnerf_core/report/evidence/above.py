@@ -147,19 +147,13 @@ def moment_of(evidence: Evidence, test: PrimaryTest) -> tuple[float, bool]:
 def groups_of_drives(evidence: Evidence, shown: Sequence[Mapping[str, Any]]) -> list[DriveGroup]:
     """Drives past the plain object, the strongest baseline and the attack, of all victims."""
     tests = [PrimaryTest.model_validate(each["test"]) for each in shown]
-    baselines = [str(each["baseline"]) for each in shown]
+    method, baselines = tests[0].method, [str(each["baseline"]) for each in shown]
     strongest = style_of(baselines[0]).title if len(set(baselines)) == 1 else "strongest baseline"
     # Three fixed colours of different lightness, for any method.
     return [
         _group(evidence, style_of(NONE).title, LIGHT[NONE], tests, [NONE] * len(tests)),
         _group(evidence, strongest, LIGHT["random"], tests, baselines),
-        _group(
-            evidence,
-            style_of(tests[0].method).title,
-            LIGHT["gradient"],
-            tests,
-            [each.method for each in tests],
-        ),
+        _group(evidence, style_of(method).title, LIGHT["gradient"], tests, [method] * len(tests)),
     ]
 
 
