@@ -23,6 +23,10 @@ from advnerf_core.driving.solids import Solids
 from advnerf_core.errors import AdvnerfError
 
 
+# A path that turns by less over a drive has no outside [rad].
+_LEAST_TURN_RAD = 0.2
+
+
 class ObjectiveError(AdvnerfError, ValueError):
     """An objective does not suit the place, or does not keep its contract."""
 
@@ -118,6 +122,42 @@ class CrossTrackError(Objective):
     def loss(self, drives: JudgedDrives) -> Tensor:
         """Minus the sum of |CTE|, ``[B]`` [m]."""
         return -drives.cte_m.abs().sum(0)
+
+
+@dataclass(frozen=True)
+class RunWide(Objective):
+    """``run_wide``: how far the car runs wide of a turn.
+
+    ``sum_t |c_t|`` has a maximum on either side of the path, and a gradient climbs the one on whose side the car happens to be. A car that
+    misses a turn is outside of it: the value is ``sum_t s c_t`` by the protocol, and the loss ``-sum_t s c_t`` of a car that continues beyond
+    the fence, where s is -1 if the path turns left in all over the distance that the car drives, and 1 if it turns right.
+    """
+
+    title = "How far the car runs wide of a turn"
+
+    def value(self, drives: JudgedDrives) -> Tensor:
+        """Sum of the error to the outside of each drive by the protocol, ``[B]`` [m]; negative inside the turn."""
+        return _outside(drives) * drives.per_drive([sum(each.ctes_m) for each in drives.metrics])
+
+    def loss(self, drives: JudgedDrives) -> Tensor:
+        """Minus the sum of the error to the outside, ``[B]`` [m]."""
+        return -_outside(drives) * drives.cte_m.sum(0)
+
+
+def _outside(drives: JudgedDrives) -> Tensor:
+    """The sign that the cross-track error has outside of the path's turn, of each drive, ``[B]``."""
+    positions = drives.states.detach()[:, :, :2].cpu().numpy().astype(np.float64)
+    driven_m = np.linalg.norm(np.diff(positions, axis=0), axis=-1).sum(0)
+    start_m = drives.path.project(positions[0]).s_m
+    ends = drives.path.pose_at(np.stack([start_m, start_m + driven_m]))
+    turned_rad = ends[1, :, 2] - ends[0, :, 2]
+    if np.abs(turned_rad).min() < _LEAST_TURN_RAD:
+        least = int(np.abs(turned_rad).argmin())
+        raise ObjectiveError(
+            f"expected a path with a turn for the objective run_wide, got one that turns by {turned_rad[least]:.2f} rad over the "
+            f"{driven_m[least]:.3g} m from the start; use the objective cte"
+        )
+    return torch.from_numpy(-np.sign(turned_rad)).to(drives.states)
 
 
 @dataclass(frozen=True)

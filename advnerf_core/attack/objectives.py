@@ -28,10 +28,16 @@ _WHAT, _MODULE = "objective", "advnerf_core.attack.objective"
 
 # Names of classes in `objective.py`, in the order of tables.
 OBJECTIVES: Mapping[str, str] = MappingProxyType(
-    {CTE: "CrossTrackError", "peak": "Peak", "time_off_track": "TimeOffTrack", "collision": "Collision"}
+    {
+        CTE: "CrossTrackError",
+        "run_wide": "RunWide",
+        "peak": "Peak",
+        "time_off_track": "TimeOffTrack",
+        "collision": "Collision",
+    }
 )
 # These depend on states and the path alone, not on obstacles.
-ON_THE_PATH = (CTE, "peak", "time_off_track")
+ON_THE_PATH = (CTE, "run_wide", "peak", "time_off_track")
 
 
 def load_objective(reference: str, folder: Path | None = None) -> Objective:

@@ -123,7 +123,7 @@ class PlacedObject(StrictModel):
     y_m: float
     z_m: float = 0.0
     yaw_rad: Angle = 0.0
-    scale: float = Field(default=1.0, gt=0.0, le=2.0)
+    scale: float = Field(default=1.0, gt=0.0, le=10.0)
     bounds: PoseBoundsConfig | None = None
     pitch_rad: Angle = 0.0
     roll_rad: Angle = 0.0
@@ -226,7 +226,7 @@ class RuledObject(StrictModel):
     name: str = Field(min_length=1)
     kind: ObjectKind
     z_m: float = 0.0
-    scale: float = Field(default=1.0, gt=0.0, le=2.0)
+    scale: float = Field(default=1.0, gt=0.0, le=10.0)
     stands: Stands
 
     @field_validator("kind")

@@ -17,6 +17,7 @@ from advnerf_core.attack.objective import (
     Objective,
     ObjectiveError,
     Peak,
+    RunWide,
     TimeOffTrack,
     loss_slopes,
     losses_of,
@@ -26,13 +27,14 @@ from advnerf_core.attack.objectives import OBJECTIVES, load_objective, objective
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon
-from advnerf_core.driving.path import Line, Path
+from advnerf_core.driving.path import Arc, Line, Path
 from advnerf_core.driving.solids import Rectangle, Solids
 from advnerf_core.plugins import PluginError, name_in_results
 from benchmarks.adjoint_gradient import backpropagated_gradient, finite_difference, relative_error
 from tests.support.attack_toy import toy_problem
 
 ROAD = Path.from_segments((0.0, 0.0, 0.0), [Line(50.0)], closed=False)  # its CTE is y
+BENT = Path.from_segments((0.0, 0.0, 0.0), [Line(1.0), Arc(3.0, -1.2)], closed=False)
 TICKS, LIMITS = 40, Horizon(40, 0.1, 0.4, 1.5)
 SOLIDS = Solids(
     (Rectangle(2.0, 1.2, 0.4, 0.3, 0.4), Rectangle(2.6, -1.3, 0.5, 0.3)), Rectangle(0.13, 0.0, 0.25, 0.15)
@@ -40,7 +42,7 @@ SOLIDS = Solids(
 LEFT = "from advnerf_core.attack.objective import Objective\n\nclass Left(Objective):\n    def value(self, drives):\n        return drives.cte_m.clamp(min=0.0).sum(0)\n"
 
 
-def random_drives(count: int, seed: int = 0, **others) -> JudgedDrives:
+def random_drives(count: int, seed: int = 0, road: Path = ROAD, **others) -> JudgedDrives:
     """Drives of a car whose turn rate wanders, some straight and some far off."""
     generator = torch.Generator().manual_seed(seed)
     car, states = Dubins(0.8, 0.1), [torch.zeros(count, 3, dtype=torch.float64)]
@@ -48,12 +50,17 @@ def random_drives(count: int, seed: int = 0, **others) -> JudgedDrives:
     bias, noise = (torch.randn(n, count, generator=generator, dtype=torch.float64) for n in (1, TICKS))
     for tick in range(TICKS):
         states.append(car.step(states[-1], 0.25 * bias[0] + 0.3 * noise[tick]))
-    return JudgedDrives(torch.stack(states), ROAD, LIMITS, solids=SOLIDS, **others)
+    return JudgedDrives(torch.stack(states), road, LIMITS, solids=SOLIDS, **others)
+
+
+def road_of(objective: str) -> Path:
+    """A road on which an objective is defined."""
+    return BENT if objective == "run_wide" else ROAD
 
 
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_the_gradient_of_a_loss_is_that_of_central_differences(name):
-    objective, drives = load_objective(name), random_drives(4)
+    objective, drives = load_objective(name), random_drives(4, road=road_of(name))
     loss, slopes = loss_slopes(objective, drives)
     assert loss == pytest.approx(float(losses_of(objective, drives).mean()), rel=1e-12)
     generator = torch.Generator().manual_seed(2)
@@ -70,7 +77,7 @@ def test_the_gradient_of_a_loss_is_that_of_central_differences(name):
 
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_a_loss_ranks_drives_as_its_value_does(name):
-    objective, drives = load_objective(name), random_drives(300, seed=5)
+    objective, drives = load_objective(name), random_drives(300, seed=5, road=road_of(name))
     values, losses = values_of(objective, drives), losses_of(objective, drives)
     assert len(values.unique()) > 10
     assert spearmanr(values, -losses).statistic > 0.95
@@ -107,9 +114,45 @@ def test_the_car_stops_at_the_fence_in_values_and_drives_on_in_losses():
         assert (values_of(objective, fenced) != values_of(objective, free)).any()
 
 
+@pytest.mark.parametrize("right", [True, False])
+def test_run_wide_is_positive_outside_of_a_turn_to_either_side(right):
+    free = random_drives(30, seed=4, road=BENT)
+    x, y = free.states[1:, :, :2].numpy().transpose(2, 0, 1)
+    past = x > 1.0
+    expected = np.where(past, np.hypot(x - 1.0, y + 3.0) - 3.0, y)  # the arc's centre is at (1, -3)
+    if not right:  # the mirror image, whose outside is on the right
+        mirrored = free.states * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+        road = Path.from_segments((0.0, 0.0, 0.0), [Line(1.0), Arc(3.0, 1.2)], closed=False)
+        free = dataclasses.replace(free, states=mirrored, path=road)
+    near = (np.abs(expected) < 0.9).all(0)
+    assert near.sum() > 5
+    np.testing.assert_allclose(values_of(RunWide(), free)[near], expected.sum(0)[near], rtol=1e-9)
+    np.testing.assert_allclose(losses_of(RunWide(), free)[near], -expected.sum(0)[near], rtol=1e-9)
+    fenced = dataclasses.replace(free, fence_m=1.0)
+    assert torch.equal(losses_of(RunWide(), fenced), losses_of(RunWide(), free))
+    assert (values_of(RunWide(), fenced) != values_of(RunWide(), free)).any()
+
+
+def test_run_wide_follows_the_turn_of_a_drive_past_the_start_of_a_closed_path():
+    loop = Path.rounded_square(4.0, 1.1)
+    start = torch.from_numpy(loop.pose_at([loop.length_m - 0.3]))  # its turns are to the left
+    states = [start]
+    for _ in range(TICKS):
+        states.append(Dubins(0.8, 0.1).step(states[-1], torch.zeros(1, dtype=torch.float64)))
+    drives = JudgedDrives(torch.stack(states), loop, LIMITS)
+    assert float(values_of(RunWide(), drives)) == pytest.approx(float(drives.cte_m.abs().sum()), rel=1e-9)
+
+
+def test_run_wide_on_a_straight_road_is_refused():
+    with pytest.raises(ObjectiveError, match=r"path with a turn .* turns by 0\.00 rad over the 3\.2 m"):
+        values_of(RunWide(), random_drives(2))
+
+
 def in_the_room(objective: Objective, steps: int = 6):
-    solids = Solids((Rectangle(0.5, -1.0, 0.3, 0.2),), SOLIDS.body)
-    return toy_problem(steps, objective=objective, solids=solids)
+    solids, starts = Solids((Rectangle(0.5, -1.0, 0.3, 0.2),), SOLIDS.body), {}
+    if isinstance(objective, RunWide):
+        starts["start_states"] = torch.tensor([[0.8, -1.95, 0.05], [0.9, -2.1, 0.0]], dtype=torch.float64)
+    return toy_problem(steps, objective=objective, solids=solids, **starts)
 
 
 @pytest.mark.parametrize("name", OBJECTIVES)
@@ -171,7 +214,7 @@ def test_names_stand_for_objectives_and_wrong_ones_are_one_line(tmp_path):
         "    def value(self, drives):\n        return drives.cte_m.sum(0)\n\nclass peak(Left):\n    pass\n\nclass Loose:\n    pass\n"
     )
     wrong = {
-        "pek": r"expected an objective of cte, peak, time_off_track, collision; got 'pek' .did you mean peak",
+        "pek": r"expected an objective of cte, run_wide, peak, time_off_track, collision; got 'pek' .did you mean peak",
         "mine.py:Loose": "expected a class that derives from Objective",
         "mine.py:Bare": "expected a class with a method value",
         "mine.py:Needy": "expected a class that is made without arguments",
