@@ -140,7 +140,7 @@ def _both(row: Mapping[str, Any]) -> str:
 def _transfers(sets: Sequence[Mapping[str, Any]], about: Mapping[str, SetAbout]) -> str:
     pairs = [[row_of(found["rows"], test, domain) for domain in DOMAINS] for found, test in _told(sets)]
     if not pairs:
-        return ""
+        return f"{_counts(sets, about)}{claimed}" if (claimed := _claimed(sets)) else ""
     smaller = [smaller_excess(there) for _, there in pairs]
     # Both domains over the same control.
     here = [
@@ -162,8 +162,8 @@ def _claimed(sets: Sequence[Mapping[str, Any]]) -> str:
     """What claims over places and victims say, also where the attack does nothing."""
     return "".join(
         f" Over {claim['places']} places and {claim['victims']} victims of {found['name']} it adds {claim['difference_m']:+.3f} m per tick to the strongest baseline "
-        f"(95 % {ends(claim['low_m'], claim['high_m'])}); more drives leave the lane at {sum(each['off_track_points'] > 0.0 for each in claim['each'])} "
-        f"of {len(claim['each'])}."
+        f"(95 % {ends(claim['low_m'], claim['high_m'])}) and {claim['off_track_points']:+.0f} points to the share of drives "
+        f"off the lane, at {sum(each['off_track_points'] > 0.0 for each in claim['each'])} of {len(claim['each'])}."
         for found in sets
         for claim in found.get("claims", ())
         if claim["difference_m"] is not None

@@ -59,7 +59,7 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     # A claim about places is told too, with the places where nothing was found.
     (transfers,) = [each.text for each in answers([], published) if each.question == "Does it transfer?"]
     assert "4 places and 2 victims of metadrive_billboard it adds +0.487 m per tick" in transfers
-    assert "more drives leave the lane at 2 of 8." in transfers
+    assert "and +22 points to the share of drives off the lane, at 2 of 8." in transfers
     # Nothing is claimed that was not measured.
     assert "How fast?" not in found
     assert answers([], tmp_path / "none") == []
@@ -97,6 +97,16 @@ def test_an_answer_counts_groups_of_searches_and_uses_the_smaller_excess(tmp_pat
     file.write_text(json.dumps(data))
     (answer,) = [each.text for each in answers([], tmp_path) if each.question == "Does it transfer?"]
     assert "In 2 of 3 comparisons" in answer
+
+
+def test_a_set_with_a_claim_and_no_test_is_told(tmp_path):
+    published = PAGE.parent / "results"
+    shutil.copytree(published / "metadrive_billboard" / "set", tmp_path / "metadrive_billboard" / "set")
+    shutil.copy(published / "sets_about.json", tmp_path / "sets_about.json")
+    (answer,) = [each.text for each in answers([], tmp_path) if each.question == "Does it transfer?"]
+    assert answer.startswith(
+        "1 registered sets are 1 groups of searches in 1 worlds: 1 sets explore, 0 confirm. Over 4 places and 2 victims"
+    )
 
 
 def test_rows_of_the_earlier_build_stand_under_a_warning_and_only_there():
