@@ -9,7 +9,7 @@ from nodes.experiment.run.set_film import MOST_BYTES
 
 ROOT = Path(__file__).parents[1]
 # 45 MB; paper_car: scenes and victims of two places 19 MB, drives and textures of its 106 cells 16 MB; paper_junction: its build 20 MB, and
-# 28 MB for its 147 cells; metadrive_billboard and duckietown_billboard: two victims and 64 cells each 14 MB, less 9 MB of explorations.
+# 28 MB for its 147 cells; metadrive_billboard, metadrive_run_wide and victims of Duckietown 14 MB, less 9 MB of explorations.
 MOST_TRACKED_BYTES = 132_000_000
 
 

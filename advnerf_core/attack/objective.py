@@ -22,7 +22,6 @@ from advnerf_core.driving.path import Path
 from advnerf_core.driving.solids import Solids
 from advnerf_core.errors import AdvnerfError
 
-
 # A path that turns by less over a drive has no outside [rad].
 _LEAST_TURN_RAD = 0.2
 
@@ -130,7 +129,7 @@ class RunWide(Objective):
 
     ``sum_t |c_t|`` has a maximum on either side of the path, and a gradient climbs the one on whose side the car happens to be. A car that
     misses a turn is outside of it: the value is ``sum_t s c_t`` by the protocol, and the loss ``-sum_t s c_t`` of a car that continues beyond
-    the fence, where s is -1 if the path turns left in all over the distance that the car drives, and 1 if it turns right.
+    the fence. Over the distance that the car drives, s is -1 where the path turns furthest from its first heading to the left, 1 to the right.
     """
 
     title = "How far the car runs wide of a turn"
@@ -149,15 +148,16 @@ def _outside(drives: JudgedDrives) -> Tensor:
     positions = drives.states.detach()[:, :, :2].cpu().numpy().astype(np.float64)
     driven_m = np.linalg.norm(np.diff(positions, axis=0), axis=-1).sum(0)
     start_m = drives.path.project(positions[0]).s_m
-    ends = drives.path.pose_at(np.stack([start_m, start_m + driven_m]))
-    turned_rad = ends[1, :, 2] - ends[0, :, 2]
-    if np.abs(turned_rad).min() < _LEAST_TURN_RAD:
-        least = int(np.abs(turned_rad).argmin())
+    headings_rad = drives.path.pose_at(start_m + np.linspace(0.0, 1.0, 65)[:, None] * driven_m)[..., 2]
+    turned_rad = headings_rad - headings_rad[0]
+    furthest_rad = np.take_along_axis(turned_rad, np.abs(turned_rad).argmax(0)[None], 0)[0]
+    least = int(np.abs(furthest_rad).argmin())
+    if abs(furthest_rad[least]) < _LEAST_TURN_RAD:
         raise ObjectiveError(
-            f"expected a path with a turn for the objective run_wide, got one that turns by {turned_rad[least]:.2f} rad over the "
+            f"expected a path with a turn for the objective run_wide, got one that turns by {furthest_rad[least]:.2f} rad over the "
             f"{driven_m[least]:.3g} m from the start; use the objective cte"
         )
-    return torch.from_numpy(-np.sign(turned_rad)).to(drives.states)
+    return torch.from_numpy(-np.sign(furthest_rad)).to(drives.states)
 
 
 @dataclass(frozen=True)

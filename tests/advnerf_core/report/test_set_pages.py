@@ -45,7 +45,7 @@ def test_every_set_shows_its_drives_from_above_and_what_the_camera_saw(name):
     text, picture = section(name), PUBLISHED / above_of(name)
     several = len(maps_of(published(name))) > 1
     # The scenarios of other sets share their searches.
-    assert several == name.startswith(("paper_", "metadrive_", "duckietown_"))
+    assert several == name.startswith(("paper_", "metadrive_"))
     what = "of each scenario from above" if several else "from above, and what the camera saw"
     assert text.lstrip().startswith(f"![All deployed drives {what}]({picture.name})")
     assert picture.stat().st_size <= MOST_BYTES == 250_000
