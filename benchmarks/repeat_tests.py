@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 
 from benchmarks.results import REPOSITORY, read_rows, record_row
 
-_LOOP = "while True: pass"
+_LOOP = "import os\nwhile os.getppid() == {parent}: pass"  # ends with the benchmark, also if that is killed
 _AGAIN = "; again"
 _MAKE_DEMO, _DEMO = ["make", "demo"], REPOSITORY / "runs" / "demo"
 
@@ -29,7 +29,8 @@ _MAKE_DEMO, _DEMO = ["make", "demo"], REPOSITORY / "runs" / "demo"
 @contextlib.contextmanager
 def busy(count: int) -> Iterator[None]:
     """Endless loops, each in a session of its own, so that each has a whole share where sessions share the processors."""
-    loops = [subprocess.Popen([sys.executable, "-c", _LOOP], start_new_session=True) for _ in range(count)]
+    command = [sys.executable, "-c", _LOOP.format(parent=os.getpid())]
+    loops = [subprocess.Popen(command, start_new_session=True) for _ in range(count)]
     try:
         yield
     finally:
