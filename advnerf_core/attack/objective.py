@@ -78,6 +78,30 @@ class JudgedDrives:
             )
         return self.solids.clearances_m(self.states[1:])
 
+    @cached_property
+    def outside(self) -> Tensor:
+        """The sign that the cross-track error has outside of the path's turn, ``[B]``, for each drive.
+
+        It is -1 if the heading of the path, over the distance that the car drives, departs furthest from its first one to the left, and 1
+        if to the right.
+
+        Raises:
+            ObjectiveError: The path hardly turns.
+        """
+        positions = self.states.detach()[:, :, :2].cpu().numpy().astype(np.float64)
+        driven_m = np.linalg.norm(np.diff(positions, axis=0), axis=-1).sum(0)
+        start_m = self.path.project(positions[0]).s_m
+        headings_rad = self.path.pose_at(start_m + np.linspace(0.0, 1.0, 65)[:, None] * driven_m)[..., 2]
+        turned_rad = headings_rad - headings_rad[0]
+        furthest_rad = np.take_along_axis(turned_rad, np.abs(turned_rad).argmax(0)[None], 0)[0]
+        least = int(np.abs(furthest_rad).argmin())
+        if abs(furthest_rad[least]) < _LEAST_TURN_RAD:
+            raise ObjectiveError(
+                f"expected a path with a turn for the objective run_wide, got one that turns by {furthest_rad[least]:.2f} rad over the "
+                f"{driven_m[least]:.3g} m from the start; use the objective cte"
+            )
+        return torch.from_numpy(-np.sign(furthest_rad)).to(self.states)
+
     def per_drive(self, values: list[float]) -> Tensor:
         """One number for each drive, ``[B]``, of the states' type."""
         return torch.tensor(values, dtype=self.states.dtype)
@@ -129,35 +153,18 @@ class RunWide(Objective):
 
     ``sum_t |c_t|`` has a maximum on either side of the path, and a gradient climbs the one on whose side the car happens to be. A car that
     misses a turn is outside of it: the value is ``sum_t s c_t`` by the protocol, and the loss ``-sum_t s c_t`` of a car that continues beyond
-    the fence. Over the distance that the car drives, s is -1 where the path turns furthest from its first heading to the left, 1 to the right.
+    the fence. The sign s is `JudgedDrives.outside`.
     """
 
     title = "How far the car runs wide of a turn"
 
     def value(self, drives: JudgedDrives) -> Tensor:
         """Sum of the error to the outside of each drive by the protocol, ``[B]`` [m]; negative inside the turn."""
-        return _outside(drives) * drives.per_drive([sum(each.ctes_m) for each in drives.metrics])
+        return drives.outside * drives.per_drive([sum(each.ctes_m) for each in drives.metrics])
 
     def loss(self, drives: JudgedDrives) -> Tensor:
         """Minus the sum of the error to the outside, ``[B]`` [m]."""
-        return -_outside(drives) * drives.cte_m.sum(0)
-
-
-def _outside(drives: JudgedDrives) -> Tensor:
-    """The sign that the cross-track error has outside of the path's turn, of each drive, ``[B]``."""
-    positions = drives.states.detach()[:, :, :2].cpu().numpy().astype(np.float64)
-    driven_m = np.linalg.norm(np.diff(positions, axis=0), axis=-1).sum(0)
-    start_m = drives.path.project(positions[0]).s_m
-    headings_rad = drives.path.pose_at(start_m + np.linspace(0.0, 1.0, 65)[:, None] * driven_m)[..., 2]
-    turned_rad = headings_rad - headings_rad[0]
-    furthest_rad = np.take_along_axis(turned_rad, np.abs(turned_rad).argmax(0)[None], 0)[0]
-    least = int(np.abs(furthest_rad).argmin())
-    if abs(furthest_rad[least]) < _LEAST_TURN_RAD:
-        raise ObjectiveError(
-            f"expected a path with a turn for the objective run_wide, got one that turns by {furthest_rad[least]:.2f} rad over the "
-            f"{driven_m[least]:.3g} m from the start; use the objective cte"
-        )
-    return torch.from_numpy(-np.sign(furthest_rad)).to(drives.states)
+        return -drives.outside * drives.cte_m.sum(0)
 
 
 @dataclass(frozen=True)

@@ -146,9 +146,8 @@ def test_run_wide_follows_the_turn_of_a_drive_past_the_start_of_a_closed_path():
 def test_run_wide_follows_the_first_of_two_turns_that_cancel():
     road = Path.from_segments((0.0, 0.0, 0.0), [Arc(1.0, 1.0), Arc(1.0, -1.2), Line(9.0)], closed=False)
     drives = random_drives(6, seed=8, road=road)
-    assert torch.equal(
-        losses_of(RunWide(), drives), drives.cte_m.sum(0)
-    )  # outside of a turn to the left is right
+    # Outside of a turn to the left is right.
+    assert torch.equal(losses_of(RunWide(), drives), drives.cte_m.sum(0))
 
 
 def test_run_wide_on_a_straight_road_is_refused():
