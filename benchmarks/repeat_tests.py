@@ -21,15 +21,19 @@ from dataclasses import dataclass, field
 
 from benchmarks.results import REPOSITORY, read_rows, record_row
 
-_LOOP = "import os\nwhile os.getppid() == {parent}: pass"  # ends with the benchmark, also if that is killed
 _AGAIN = "; again"
 _MAKE_DEMO, _DEMO = ["make", "demo"], REPOSITORY / "runs" / "demo"
+
+
+def endless_loop() -> tuple[str, ...]:
+    """Arguments of a Python that computes until this process ends, also if it is killed."""
+    return "-c", f"import os\nwhile os.getppid() == {os.getpid()}: pass"
 
 
 @contextlib.contextmanager
 def busy(count: int) -> Iterator[None]:
     """Endless loops, each in a session of its own, so that each has a whole share where sessions share the processors."""
-    command = [sys.executable, "-c", _LOOP.format(parent=os.getpid())]
+    command = [sys.executable, *endless_loop()]
     loops = [subprocess.Popen(command, start_new_session=True) for _ in range(count)]
     try:
         yield

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from benchmarks.repeat_tests import endless_loop
 from hardware.emulators.vesc_firmware import WireEvent
 from nodes.runtime.arm_requests import ask_to_arm
 from nodes.runtime.errors import LaunchError
@@ -66,7 +67,7 @@ def busy_lab() -> Iterator[Graph]:
         arguments = ("-m", "nodes.viewer", "--folder", str(graph.folder), "--set", "port=0")
         others = [
             subprocess.Popen([sys.executable, *words], cwd=REPOSITORY, stdout=graph.log, stderr=graph.log)
-            for words in (arguments, ("-c", "while True: pass"))
+            for words in (arguments, endless_loop())
         ]
         try:
             graph.ready()
