@@ -98,7 +98,7 @@ class JudgedDrives:
         if abs(furthest_rad[least]) < _LEAST_TURN_RAD:
             raise ObjectiveError(
                 f"expected a path with a turn for the objective run_wide, got one that turns by {furthest_rad[least]:.2f} rad over the "
-                f"{driven_m[least]:.3g} m from the start; use the objective cte"
+                f"{driven_m[least]:.3g} m from the start; use cte, drift_left or drift_right"
             )
         return torch.from_numpy(-np.sign(furthest_rad)).to(self.states)
 
@@ -147,24 +147,58 @@ class CrossTrackError(Objective):
         return -drives.cte_m.abs().sum(0)
 
 
-@dataclass(frozen=True)
-class RunWide(Objective):
-    """``run_wide``: how far the car runs wide of a turn.
+class ToOneSide(Objective):
+    """How far the car drives to one side of its path: the common part of `DriftLeft`, `DriftRight` and `RunWide`.
 
-    ``sum_t |c_t|`` has a maximum on either side of the path, and a gradient climbs the one on whose side the car happens to be. A car that
-    misses a turn is outside of it: the value is ``sum_t s c_t`` by the protocol, and the loss ``-sum_t s c_t`` of a car that continues beyond
-    the fence. The sign s is `JudgedDrives.outside`.
+    ``sum_t |c_t|`` has a maximum on either side of the path, and a gradient climbs the one on whose side the car happens to be. The value
+    is ``sum_t s c_t`` by the protocol, and the loss ``-sum_t s c_t`` of a car that continues beyond the fence, with the sign s of
+    one side.
     """
+
+    def side(self, drives: JudgedDrives) -> Tensor | float:
+        """The sign s of all drives, or of each, ``[B]``: 1 is left."""
+        raise NotImplementedError(f"{type(self).__name__} has no side(); implement it")
+
+    def value(self, drives: JudgedDrives) -> Tensor:
+        """Sum of the error to the side by the protocol, ``[B]`` [m]; negative on the other side."""
+        return self.side(drives) * drives.per_drive([sum(each.ctes_m) for each in drives.metrics])
+
+    def loss(self, drives: JudgedDrives) -> Tensor:
+        """Minus the sum of the error to the side, ``[B]`` [m]."""
+        return -self.side(drives) * drives.cte_m.sum(0)
+
+
+@dataclass(frozen=True)
+class RunWide(ToOneSide):
+    """``run_wide``: how far the car runs wide of a turn, as a car that misses a turn is outside of it."""
 
     title = "How far the car runs wide of a turn"
 
-    def value(self, drives: JudgedDrives) -> Tensor:
-        """Sum of the error to the outside of each drive by the protocol, ``[B]`` [m]; negative inside the turn."""
-        return drives.outside * drives.per_drive([sum(each.ctes_m) for each in drives.metrics])
+    def side(self, drives: JudgedDrives) -> Tensor | float:
+        """`JudgedDrives.outside`."""
+        return drives.outside
 
-    def loss(self, drives: JudgedDrives) -> Tensor:
-        """Minus the sum of the error to the outside, ``[B]`` [m]."""
-        return -drives.outside * drives.cte_m.sum(0)
+
+@dataclass(frozen=True)
+class DriftLeft(ToOneSide):
+    """``drift_left``: how far the car drives to the left of its path."""
+
+    title = "How far the car drives to the left of its path"
+
+    def side(self, drives: JudgedDrives) -> Tensor | float:
+        """1."""
+        return 1.0
+
+
+@dataclass(frozen=True)
+class DriftRight(ToOneSide):
+    """``drift_right``: how far the car drives to the right of its path."""
+
+    title = "How far the car drives to the right of its path"
+
+    def side(self, drives: JudgedDrives) -> Tensor | float:
+        """-1."""
+        return -1.0
 
 
 @dataclass(frozen=True)

@@ -31,13 +31,15 @@ OBJECTIVES: Mapping[str, str] = MappingProxyType(
     {
         CTE: "CrossTrackError",
         "run_wide": "RunWide",
+        "drift_left": "DriftLeft",
+        "drift_right": "DriftRight",
         "peak": "Peak",
         "time_off_track": "TimeOffTrack",
         "collision": "Collision",
     }
 )
 # These depend on states and the path alone, not on obstacles.
-ON_THE_PATH = (CTE, "run_wide", "peak", "time_off_track")
+ON_THE_PATH = (CTE, "run_wide", "drift_left", "drift_right", "peak", "time_off_track")
 
 
 def load_objective(reference: str, folder: Path | None = None) -> Objective:

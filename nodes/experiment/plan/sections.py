@@ -256,7 +256,7 @@ class AttackConfig(StrictModel):
 
     objective: ObjectiveReference = Field(
         default=CTE,
-        description="What is maximised: cte, run_wide, peak, time_off_track, collision, or file.py:Class, relative to this file.",
+        description="What is maximised: cte, run_wide, drift_left, drift_right, peak, time_off_track, collision, or file.py:Class, relative to this file.",
     )
     evaluations: Positive = Field(
         default=50, description="Closed-loop evaluations of each search; an iteration of the gradient is one."

@@ -13,6 +13,8 @@ from advnerf_core.attack.methods import METHODS, SearchRun, SearchSettings
 from advnerf_core.attack.objective import (
     Collision,
     CrossTrackError,
+    DriftLeft,
+    DriftRight,
     JudgedDrives,
     Objective,
     ObjectiveError,
@@ -133,6 +135,23 @@ def test_run_wide_is_positive_outside_of_a_turn_to_either_side(right):
     assert (values_of(RunWide(), fenced) != values_of(RunWide(), free)).any()
 
 
+@pytest.mark.parametrize("road", [ROAD, BENT], ids=["straight", "bent"])
+def test_a_drift_to_one_side_is_minus_that_to_the_other_and_outside_is_one_of_them(road):
+    drives = dataclasses.replace(random_drives(20, seed=5, road=road), fence_m=1.0)
+    left, right = values_of(DriftLeft(), drives), values_of(DriftRight(), drives)
+    free = dataclasses.replace(drives, fence_m=None)
+    signed = road.project(free.states[1:, :, :2].numpy()).cte_m
+    np.testing.assert_allclose(losses_of(DriftLeft(), drives), -signed.sum(0), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(values_of(DriftLeft(), free), signed.sum(0), rtol=1e-9)
+    assert (left > 0.0).any()
+    assert (left < 0.0).any()
+    assert (left != values_of(DriftLeft(), free)).any()
+    assert torch.equal(left, -right)
+    assert torch.equal(losses_of(DriftLeft(), drives), -losses_of(DriftRight(), drives))
+    if road is BENT:  # it turns to the right
+        assert torch.equal(values_of(RunWide(), drives), left)
+
+
 def test_run_wide_follows_the_turn_of_a_drive_past_the_start_of_a_closed_path():
     loop = Path.rounded_square(4.0, 1.1)
     start = torch.from_numpy(loop.pose_at([loop.length_m - 0.3]))  # its turns are to the left
@@ -221,7 +240,7 @@ def test_names_stand_for_objectives_and_wrong_ones_are_one_line(tmp_path):
         "    def value(self, drives):\n        return drives.cte_m.sum(0)\n\nclass peak(Left):\n    pass\n\nclass Loose:\n    pass\n"
     )
     wrong = {
-        "pek": r"expected an objective of cte, run_wide, peak, time_off_track, collision; got 'pek' .did you mean peak",
+        "pek": r"expected an objective of cte, run_wide, drift_left, drift_right, peak, time_off_track, collision; got 'pek' .did you mean peak",
         "mine.py:Loose": "expected a class that derives from Objective",
         "mine.py:Bare": "expected a class with a method value",
         "mine.py:Needy": "expected a class that is made without arguments",
