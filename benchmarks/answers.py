@@ -213,7 +213,7 @@ def _victims(sets: Sequence[Mapping[str, Any]], published: Path) -> str:
     place = next(name for name, each in named if each is off)
     whom = "them" if len(titles) == 1 else "those trained with textures"
     return (
-        f"Policies {' or '.join(titles)}. The best random search of each set moves {whom} {min(each.deployed.best_m for each in found):.3f} to "
+        f"Victims, as their sets name them: {', '.join(titles)}. The best random search of each set moves {whom} {min(each.deployed.best_m for each in found):.3f} to "
         f"{worst.deployed.best_m:.3f} m per tick where it is deployed (set {place}: {off.deployed.off_track} of {off.deployed.drives} drives off the track, "
         f"{off.deployed.all_off_track} of {off.deployed.all_drives} of all {off.searches} searches), and up to "
         f"{max(each.surrogate.best_m for each in found):.3f} m in the learned scene."

@@ -18,7 +18,10 @@ from benchmarks.results import REPOSITORY, LedgerRow
 
 COMMAND = "python -m benchmarks.paper_table"
 PUBLISHED = REPOSITORY / "docs" / "results"
-_PAPER, _IDEALISED = ("paper_car", "paper_junction"), ("nothing_idealised", "imperfect_camera")
+# The sets of each experiment, with what later ones changed.
+_CARS = {"paper_car": "", "paper_monitor": ", beside the way of a car that misses the corner"}
+_JUNCTIONS = {"paper_junction": "", "paper_junction_sides": ", one side of the path maximised"}
+_IDEALISED = ("nothing_idealised", "imperfect_camera")
 _METHOD, _VICTIM = "gradient", "hardened"
 # Smallest lower bound of the excess over the stronger control [m per tick], and what the paper reports.
 _EXCESS_M, _REPORTED_M = 0.5, {"straight": 0.89, "right": 1.31, "left": 1.32}
@@ -42,14 +45,19 @@ def ledger_rows(published: Path = PUBLISHED) -> list[LedgerRow]:
 
 def _rows(published: Path) -> Iterator[LedgerRow]:
     there = complete_sets(published)
-    sets = {name: read_json(published / name / SET) for name in (*_PAPER, *_IDEALISED) if name in there}
-    if tests := [test for name in _PAPER if name in sets for test in sets[name]["primary"]]:
+    sets = {
+        name: read_json(published / name / SET)
+        for name in (*_CARS, *_JUNCTIONS, *_IDEALISED)
+        if name in there
+    }
+    if tests := [test for name in (*_CARS, *_JUNCTIONS) if name in sets for test in sets[name]["primary"]]:
         yield _tests(tests)
-    for scenario, target in _OFF_TRACK.items():
-        if "paper_car" in sets:
-            yield _off_track(sets["paper_car"]["rows"], scenario, target)
-    if "paper_junction" in sets:
-        yield from _excess(sets["paper_junction"]["rows"])
+    for name, changed in _CARS.items():
+        if name in sets:
+            yield from _off_track(sets[name]["rows"], changed)
+    for name, changed in _JUNCTIONS.items():
+        if name in sets:
+            yield from _excess(sets[name]["rows"], changed)
     for name in _IDEALISED:
         if name in sets:
             yield from _left(sets[name]["rows"])
@@ -66,7 +74,13 @@ def _tests(tests: list[dict[str, Any]]) -> LedgerRow:
     return LedgerRow(line, len(shown), f"of {len(tests)}", "all", len(shown) == len(tests), COMMAND, note)
 
 
-def _off_track(rows: list[dict[str, Any]], scenario: str, target: float) -> LedgerRow:
+def _off_track(rows: list[dict[str, Any]], changed: str) -> Iterator[LedgerRow]:
+    for scenario, target in _OFF_TRACK.items():
+        if any(each["scenario"] == scenario for each in rows):
+            yield _off_track_past(rows, scenario, target, changed)
+
+
+def _off_track_past(rows: list[dict[str, Any]], scenario: str, target: float, changed: str) -> LedgerRow:
     ours = _row(rows, scenario, _METHOD)
     without = [
         each
@@ -82,21 +96,21 @@ def _off_track(rows: list[dict[str, Any]], scenario: str, target: float) -> Ledg
     )
     value = 100.0 * ours["off_track"] / ours["drives"]
     name = scenario.replace("_", " ")
-    line = f"the paper's car, {name}, victim trained with textures: drives off the track past the gradient's attack"
+    line = f"the paper's car, {name}{changed}, victim trained with textures: drives off the track past the gradient's attack"
     return LedgerRow(line, round(value), "%", f">= {target:g} %", value >= target, COMMAND, note)
 
 
-def _excess(rows: list[dict[str, Any]]) -> Iterator[LedgerRow]:
+def _excess(rows: list[dict[str, Any]], changed: str) -> Iterator[LedgerRow]:
     """The lower bound of the excess over the control past which the car errs more: the plain objects, or none."""
-    for scenario, reported_m in _REPORTED_M.items():
+    for scenario in dict.fromkeys(each["scenario"] for each in rows if each["scenario"] in _REPORTED_M):
         ours, plain = (_row(rows, scenario, method) for method in (_METHOD, NONE))
         excess = smaller_excess(ours)
         assert excess.low_m is not None, "the set has several searches"
         note = (
             f"{excess.mean_m:.3f} m in the mean over {excess.over}s, {ours['searches']} searches, {ours['off_track']} of {ours['drives']} drives off the track; "
-            f"{plain['off_track']} of {plain['drives']} past plain objects; the paper, with its own car and scale: {reported_m:+.2f} m"
+            f"{plain['off_track']} of {plain['drives']} past plain objects; the paper, with its own car and scale: {_REPORTED_M[scenario]:+.2f} m"
         )
-        line = f"the paper's junction, {scenario}, victim trained with textures: excess past the gradient's attack, lower 95 % bound"
+        line = f"the paper's junction, {scenario}{changed}, victim trained with textures: excess past the gradient's attack, lower 95 % bound"
         target = f"> {_EXCESS_M:g} m per tick"
         yield LedgerRow(
             line, round(excess.low_m, 3), "m per tick", target, excess.low_m > _EXCESS_M, COMMAND, note

@@ -43,7 +43,7 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     # The maximum over searches, from the kept drives: an attacker takes it.
     victims = found["Against which victims?"]
     assert victims.startswith(
-        "Policies trained with textures. The best random search of each set moves them 0.169 to 0.169 m"
+        "Victims, as their sets name them: trained with textures. The best random search of each set moves them 0.169 to 0.169 m"
     )
     assert "(set room: 5 of 5 drives off the track, 20 of 30 of all 6 searches), and up to 0.185 m" in victims
     (line,) = sets_table(tmp_path).splitlines()[2:]
