@@ -1,4 +1,4 @@
-"""Intervals and equivalence tests of a mean excess over searches and starts."""
+"""Intervals of a mean excess over searches and starts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from advnerf_core.report.evidence.mean_estimate import MeanEstimate, crossed, di
 Floats = NDArray[np.float64]
 Over = Literal["searches and starts", "searches", "starts"]
 LEVEL = 0.95
-ALPHA = 0.05
 # Smallest and largest coverage [%] of 95 % intervals of six searches from twenty starts, rounded, over the designs of `benchmarks/coverage.py`.
 MEASURED_COVERAGE = (89.0, 99.0)
 
@@ -44,25 +43,6 @@ class ClusteredInterval:
     over: Over
     searches: int
     drives: int
-
-
-@dataclass(frozen=True)
-class Equivalence:
-    """Result of an equivalence test.
-
-    Attributes:
-        p: p-value of the hypothesis that the true mean is outside the margin.
-        equivalent: Whether p is below alpha. The interval is then within the margin.
-        margin: Largest mean, of either sign, that counts as no effect; in the unit of the values.
-        alpha: Level of the test.
-        interval: The interval with coverage ``1 - 2 alpha``.
-    """
-
-    p: float
-    equivalent: bool
-    margin: float
-    alpha: float
-    interval: ClusteredInterval
 
 
 def clustered_interval(
@@ -120,34 +100,6 @@ def difference_interval(one: ArrayLike, other: ArrayLike, level: float = LEVEL) 
     if min(*ours.shape, *theirs.shape) < 2:
         return None
     return _interval([*ours, *theirs], difference(ours, theirs), "searches and starts", level)
-
-
-def equivalence(
-    values: Iterable[ArrayLike], margin: float, alpha: float = ALPHA, shared_starts: bool = True
-) -> Equivalence | None:
-    """Two one-sided tests (Schuirmann 1987) that the mean lies within ``-margin .. margin``.
-
-    Args:
-        values: One row for each search, one value for each start ``[searches][starts]``.
-        margin: Largest mean, of either sign, that counts as no effect; in the unit of the values.
-        alpha: Level of the test, within 0..0.5.
-        shared_starts: See `clustered_interval`.
-
-    Returns:
-        The test, or None for fewer than two values. Its interval names the population of the claim.
-    """
-    if not 0.0 < margin < np.inf:
-        raise ValueError(
-            f"expected a positive, finite margin, got {margin}; fix the largest effect that does not matter"
-        )
-    if not 0.0 < alpha < 0.5:
-        raise ValueError(f"expected alpha within 0..0.5, got {alpha}; pass 0.05 for 5 %")
-    rows = _rows(values, shared_starts)
-    found = _estimate(rows, shared_starts)
-    if not found:
-        return None
-    p = max(float(found[0].p_above(-margin)), float(found[0].p_below(margin)))
-    return Equivalence(p, p < alpha, margin, alpha, _interval(rows, *found, 1.0 - 2.0 * alpha))
 
 
 def _rows(values: Iterable[ArrayLike], shared_starts: bool) -> list[Floats]:

@@ -1,4 +1,4 @@
-"""Clustered intervals and equivalence tests against closed forms, scipy, and measured coverage."""
+"""Clustered intervals against closed forms, scipy, and measured coverage."""
 
 import dataclasses
 import math
@@ -14,7 +14,6 @@ from advnerf_core.report.evidence.intervals import (
     MEASURED_COVERAGE,
     clustered_interval,
     difference_interval,
-    equivalence,
 )
 from advnerf_core.report.evidence.mean_estimate import crossed, difference, one_sample
 from benchmarks.results import read_rows
@@ -67,7 +66,6 @@ def test_one_search_speaks_for_starts_alone_and_one_start_for_searches_alone():
 @pytest.mark.parametrize("shared", [True, False])
 def test_a_single_drive_has_no_interval(shared):
     assert clustered_interval([[0.3]], shared_starts=shared) is None
-    assert equivalence([[0.3]], 1.0, shared_starts=shared) is None
 
 
 def test_additive_effects_give_the_welch_interval_of_two_samples():
@@ -196,39 +194,19 @@ def test_intervals_of_six_searches_from_twenty_starts_cover_93_to_97_percent(dev
     assert (first.low, first.high) == pytest.approx((float(low[0]), float(high[0])))
 
 
-def test_an_equivalence_test_is_two_one_sided_t_tests():
-    rows = [[mean, mean] for mean in SYMMETRIC]
-    for margin in (0.55, 0.8, 1.5):
-        found = equivalence(rows, margin, shared_starts=False)
-        above = stats.ttest_1samp(SYMMETRIC, -margin, alternative="greater").pvalue
-        below = stats.ttest_1samp(SYMMETRIC, margin, alternative="less").pvalue
-        assert found.p == pytest.approx(max(above, below))
-        assert found.equivalent == (found.p < 0.05)
-        low, high = stats.t.interval(0.9, 5, np.mean(SYMMETRIC), stats.sem(SYMMETRIC))
-        assert (found.interval.low, found.interval.high) == pytest.approx((low, high))
-        assert (found.margin, found.alpha) == (margin, 0.05)
-
-
-@given(DRIVES, st.floats(0.05, 8.0), st.sampled_from([0.01, 0.05, 0.2]))
-def test_equivalence_is_an_interval_within_the_margin(drives, margin, alpha):
-    found = equivalence(drives, margin, alpha)
-    ends = found.interval.low, found.interval.high
-    assert found.interval == clustered_interval(drives, 1.0 - 2.0 * alpha)
-    if min(abs(ends[0] + margin), abs(ends[1] - margin)) > 1e-9:
-        assert found.equivalent == (-margin < ends[0] and ends[1] < margin)
-
-
-def test_an_effect_outside_the_margin_or_without_precision_is_not_equivalent():
-    assert not equivalence([SYMMETRIC], 0.1).equivalent
-    assert not equivalence([[-1.0, 1.0]], 0.5).equivalent
-    assert equivalence([SYMMETRIC], 0.1).interval.over == "starts"
+def test_one_sided_p_values_are_those_of_t_tests():
+    estimate = one_sample(np.array(SYMMETRIC))
+    for bound in (-0.55, 0.3, 1.5):
+        for found, side in ((estimate.p_above(bound), "greater"), (estimate.p_below(bound), "less")):
+            expected = stats.ttest_1samp(SYMMETRIC, bound, alternative=side).pvalue
+            assert float(found) == pytest.approx(expected)
+    flat = crossed(np.full((6, 20), 0.25))
+    assert (float(flat.p_above(0.1)), float(flat.p_below(0.1))) == (0.0, 1.0)
 
 
 def test_values_without_spread_have_an_interval_of_zero_width():
     found = clustered_interval(np.full((6, 20), 0.25))
     assert (found.low, found.high, found.standard_error) == (0.25, 0.25, 0.0)
-    assert equivalence(np.zeros((6, 20)), 0.1).p == 0.0
-    assert equivalence(np.full((6, 20), 0.25), 0.1).p == 1.0
 
 
 @pytest.mark.parametrize(
@@ -245,23 +223,12 @@ def test_values_without_spread_have_an_interval_of_zero_width():
 def test_values_that_are_no_table_of_searches_and_starts_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
         clustered_interval(values)
-    with pytest.raises(ValueError, match=message):
-        equivalence(values, 1.0)
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 95.0, math.nan])
 def test_a_level_is_within_0_and_1(level):
     with pytest.raises(ValueError, match=r"level within 0..1, got .*; pass 0.95"):
         clustered_interval([SYMMETRIC], level)
-
-
-def test_a_margin_is_positive_and_a_test_level_is_below_a_half():
-    for margin in (0.0, -1.0, math.inf, math.nan):
-        with pytest.raises(ValueError, match="positive, finite margin, got"):
-            equivalence([SYMMETRIC], margin)
-    for alpha in (0.0, 0.5, math.nan):
-        with pytest.raises(ValueError, match=r"alpha within 0..0.5, got"):
-            equivalence([SYMMETRIC], 1.0, alpha)
 
 
 def two_methods(rng, count=(), searches=(6, 6), starts=20, varies=(0.3, 0.3), common=0.3, own=0.2, noise=0.3):
