@@ -24,13 +24,11 @@ class PermutationTest:
     Attributes:
         p: One-sided p-value; None if no test is claimed.
         difference: Mean of a minus mean of b, in the unit of the values.
-        splits: Number of ways to split the searches into two methods; no p is below ``1 / splits``.
         reason: Why p is None; empty otherwise.
     """
 
     p: float | None
     difference: float
-    splits: int
     reason: str = ""
 
 
@@ -68,7 +66,7 @@ def permutation_test(a: ArrayLike, b: ArrayLike) -> PermutationTest:
     splits = math.comb(ours.size + theirs.size, ours.size)
     difference = float(ours.mean() - theirs.mean())
     if min(ours.size, theirs.size) < MIN_SEARCHES:
-        return PermutationTest(None, difference, splits, FEW_SEARCHES)
+        return PermutationTest(None, difference, FEW_SEARCHES)
     if splits > MAX_SPLITS:
         raise ValueError(
             f"expected at most {MAX_SPLITS} splits of the searches, got {splits} from {ours.size} and "
@@ -79,7 +77,7 @@ def permutation_test(a: ArrayLike, b: ArrayLike) -> PermutationTest:
     # The difference of means grows with the sum of a. Sums that differ by rounding are ties and count against a.
     sums = pooled[_splits(ours.size, pooled.size)].sum(axis=1)
     observed = pooled[: ours.size].sum() - 1e-12 * np.abs(pooled).sum()
-    return PermutationTest(np.count_nonzero(sums >= observed) / splits, difference, splits)
+    return PermutationTest(np.count_nonzero(sums >= observed) / splits, difference)
 
 
 def mcnemar_exact(only_a: int, only_b: int) -> float:

@@ -26,9 +26,6 @@ class ClusteredInterval:
         mean: Mean over searches of their means over starts.
         low: Lower end.
         high: Upper end.
-        level: Nominal coverage.
-        standard_error: Clustered standard error of the mean.
-        degrees_of_freedom: Degrees of freedom of the standard error.
         over: The population of the interval. ``"searches and starts"``: new searches driven from new
             starts. ``"searches"``: new searches driven from this one start. ``"starts"``: this one search
             driven from new starts.
@@ -37,12 +34,7 @@ class ClusteredInterval:
     mean: float
     low: float
     high: float
-    level: float
-    standard_error: float
-    degrees_of_freedom: float
     over: Over
-    searches: int
-    drives: int
 
 
 def clustered_interval(
@@ -73,7 +65,7 @@ def clustered_interval(
         raise ValueError(f"expected a level within 0..1, got {level}; pass 0.95 for 95 %")
     rows = _rows(values, shared_starts)
     found = _estimate(rows, shared_starts)
-    return _interval(rows, *found, level) if found else None
+    return _interval(*found, level) if found else None
 
 
 def difference_interval(one: ArrayLike, other: ArrayLike, level: float = LEVEL) -> ClusteredInterval | None:
@@ -99,7 +91,7 @@ def difference_interval(one: ArrayLike, other: ArrayLike, level: float = LEVEL) 
         )
     if min(*ours.shape, *theirs.shape) < 2:
         return None
-    return _interval([*ours, *theirs], difference(ours, theirs), "searches and starts", level)
+    return _interval(difference(ours, theirs), "searches and starts", level)
 
 
 def _rows(values: Iterable[ArrayLike], shared_starts: bool) -> list[Floats]:
@@ -132,16 +124,6 @@ def _estimate(rows: list[Floats], shared_starts: bool) -> tuple[MeanEstimate, Ov
     return crossed(np.stack(rows)), "searches and starts"
 
 
-def _interval(rows: list[Floats], estimate: MeanEstimate, over: Over, level: float) -> ClusteredInterval:
+def _interval(estimate: MeanEstimate, over: Over, level: float) -> ClusteredInterval:
     low, high = estimate.ends(level)
-    return ClusteredInterval(
-        mean=float(estimate.mean),
-        low=float(low),
-        high=float(high),
-        level=level,
-        standard_error=float(estimate.standard_error),
-        degrees_of_freedom=float(estimate.degrees_of_freedom),
-        over=over,
-        searches=len(rows),
-        drives=sum(row.size for row in rows),
-    )
+    return ClusteredInterval(float(estimate.mean), float(low), float(high), over)
