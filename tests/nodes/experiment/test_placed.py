@@ -151,10 +151,7 @@ def test_the_picture_from_above_shows_paths_and_objects(experiment: Experiment) 
     assert not np.array_equal(picture, bare)
 
 
-def test_a_world_without_a_view_from_above_is_drawn_as_a_plan(
+def test_a_world_without_a_view_from_above_has_no_such_picture(
     experiment: Experiment, wall: Intersection
 ) -> None:
-    picture = from_above(experiment, wall)
-    assert picture.shape == (720, 960, 3)
-    for rgb in ((40, 110, 230), (235, 140, 20), (200, 40, 170), (240, 30, 30), (150, 150, 150)):
-        assert (np.abs(picture.astype(int) - rgb).max(axis=-1) < 12).sum() > 50
+    assert from_above(experiment, wall) is None
