@@ -104,13 +104,12 @@ def mcnemar_per_search(off_a: ArrayLike, off_b: ArrayLike) -> tuple[McNemar, ...
 
     Args:
         off_a: Whether each drive of each search of the attack left the track ``[searches, starts]``.
-        off_b: The same of the baseline, from the same starts. ``[starts]`` compares all searches with one
-            search of the baseline, ``[searches, starts]`` compares row by row.
+        off_b: The same of the baseline, from the same starts; its searches are compared row by row.
     """
     ours, theirs = np.asarray(off_a), np.asarray(off_b)
-    if ours.ndim != 2 or ours.size == 0 or theirs.shape not in (ours.shape, ours.shape[1:]):
+    if ours.ndim != 2 or ours.size == 0 or theirs.shape != ours.shape:
         raise ValueError(
-            "expected off-track flags [searches, starts] of a, and [starts] or [searches, starts] of b, "
+            "expected off-track flags [searches, starts] of both a and b, "
             f"got shapes {list(ours.shape)} and {list(theirs.shape)}; drive both from the same starts"
         )
     if ours.dtype != np.bool_ or theirs.dtype != np.bool_:

@@ -127,18 +127,16 @@ def test_mcnemar_per_search_pairs_the_drives_by_start():
     attack = np.array([[True] * 6 + [False] * 2, [True, False] * 4])
     baseline = np.array([[False] * 7 + [True], [True, False] * 4])
     assert mcnemar_per_search(attack, baseline) == (McNemar(6, 1, mcnemar_exact(6, 1)), McNemar(0, 0, 1.0))
-    same = mcnemar_per_search(attack, baseline[0])
-    assert same[0] == mcnemar_per_search(attack, baseline)[0]
-    assert (same[1].only_a, same[1].only_b) == (4, 1)
 
 
 @pytest.mark.parametrize(
     ("a", "b", "message"),
     [
-        (np.ones((2, 3), bool), np.ones(2, bool), r"got shapes \[2, 3\] and \[2\]; drive both"),
+        (np.ones((2, 3), bool), np.ones((2, 2), bool), r"got shapes \[2, 3\] and \[2, 2\]; drive both"),
+        (np.ones((2, 3), bool), np.ones(3, bool), r"got shapes \[2, 3\] and \[3\]"),
         (np.ones(3, bool), np.ones(3, bool), r"got shapes \[3\] and \[3\]"),
         (np.ones((0, 3), bool), np.ones(3, bool), r"got shapes \[0, 3\] and \[3\]"),
-        (np.ones((2, 3)), np.ones(3, bool), "of type bool, got float64 and bool; compare"),
+        (np.ones((2, 3)), np.ones((2, 3), bool), "of type bool, got float64 and bool; compare"),
     ],
 )
 def test_off_track_flags_of_other_starts_or_types_are_refused(a, b, message):
