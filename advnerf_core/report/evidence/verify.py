@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.report.cells import CellError
 from advnerf_core.report.evidence.about import check_about
 from advnerf_core.report.evidence.publishing import page_text
-from advnerf_core.report.evidence.registration import SetError, read_withdrawn
+from advnerf_core.report.evidence.registration import read_withdrawn
 from advnerf_core.report.evidence.results import Evidence, read_evidence
 from advnerf_core.report.evidence.verifying.checks import set_problems
 from advnerf_core.report.evidence.verifying.digests import beside_problems, file_problems, known_digests
@@ -52,7 +51,7 @@ def verify_set(folder: Path) -> Verified:
     try:
         evidence = read_evidence(folder)
         withdrawn, declared = read_withdrawn(folder), read_declared(folder)
-    except (SetError, CellError) as error:
+    except AdvnerfError as error:
         return Verified(folder.name, 0, 0, (str(error),))
     try:
         missing = len(missing_cells(evidence, withdrawn))

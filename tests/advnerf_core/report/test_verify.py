@@ -307,6 +307,18 @@ def test_the_command_verifies_all_sets_and_fails_where_one_is_wrong(copied):
     assert "expected a set of simulated" in str(call("other").exception)
 
 
+def test_a_damaged_registration_is_a_problem_of_its_set_and_the_others_are_still_verified(copied):
+    damaged = copied.parent / "another"
+    (damaged / FILE).parent.mkdir(parents=True)
+    (damaged / FILE).write_text((copied / FILE).read_text()[:-20])
+    (problem,) = verify_set(damaged).problems
+    assert problem.startswith(f"{damaged / FILE}:")
+    done = CliRunner().invoke(app, ["verify", "--folder", str(copied.parent)])
+    assert done.exit_code == 1
+    assert "another: 0 numbers from 0 drives: 1 problems" in done.output
+    assert f"simulated: {verify_set(copied).numbers} numbers from 260 drives: all as published" in done.output
+
+
 def test_what_is_only_registered_awaits_its_results_and_what_vanished_does_not(copied):
     for file in [*copied.glob("*.json"), copied / SET]:
         file.unlink()
