@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.plan import plan_cells
 from nodes.experiment.run.store import Store
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.pose_maps import draw_maps
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
@@ -22,13 +22,12 @@ def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int | None 
     """
     store, pictures = Store(experiment.folder), []
     for cell in cells:
-        (job,) = plan_cells(experiment, [cell])
-        status = store.status(cell, job.settings_hash)
+        inside = experiment.of(cell)
+        status = store.status(cell, settings_hash(inside, cell.inside))
         if status.state != "done" or status.result is None:
             continue
         with ProgressDisplay() as display:
             report = display.start(cell.name)
-            inside = experiment.of(cell)
             wanted = inside.config.maps.object if number is None else number
             pictures += draw_maps(inside, cell.inside, wanted, store.work(cell.name), report)
     if not pictures:

@@ -106,7 +106,7 @@ def current_key(experiment: Experiment, cell: Cell) -> str | None:
         ConfigError: The cell's variant is wrong.
     """
     try:
-        return plan_cells(experiment, [cell])[0].settings_hash
+        return settings_hash(experiment.of(cell), cell.inside)
     except ConfigError:
         raise
     except (RuntimeFault, OSError):

@@ -14,9 +14,9 @@ from advnerf_core.report.predictions import Predicted
 from nodes.experiment.engine.artefact import read_current
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import is_predictable
-from nodes.experiment.run.plan import plan_cells
 from nodes.experiment.run.store import Store
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.keys import settings_hash
 
 if TYPE_CHECKING:
     from nodes.experiment.run.gate import GateDrive
@@ -40,26 +40,27 @@ def predict_cells(
     for cell in cells:
         if not cell.searched:
             continue
-        (job,) = plan_cells(experiment, [cell])
-        # Work with other settings may have a search too, of another attack.
-        if not is_predictable(experiment.of(cell)):
+        inside = experiment.of(cell)
+        if not is_predictable(inside):
             continue
+        # Work with other settings may have a search too, of another attack.
+        key = settings_hash(inside, cell.inside)
         file = prediction_file(experiment.folder, cell.name)
-        kept = kept_prediction(file, job.settings_hash)
+        kept = kept_prediction(file, key)
         if kept is not None and kept.get("draws") == draws:
             continue
-        if not store.has_begun(cell.name, job.settings_hash):
+        if not store.has_begun(cell.name, key):
             if kept is not None or store.result(cell.name) is not None:
                 say(f"{cell.name}: not predicted, as its search is not in {store.work(cell.name)}")
             continue
-        which = (experiment.of(cell), cell.inside, store.work(cell.name))
+        which = (inside, cell.inside, store.work(cell.name))
         if lacking := lacks(*which):
             say(f"{cell.name}: not predicted, as it lacks {lacking}")
             continue
         drive = (cell.scenario, cell.victim, cell.seed)
         found, clean[drive] = predict_cell(*which, draws, clean.get(drive))
         summary = clean[drive].agreement.summary()
-        record = {"settings_hash": job.settings_hash, **found.record(), "clean_drive": summary}
+        record = {"settings_hash": key, **found.record(), "clean_drive": summary}
         write_json(file, record)
         say(
             f"{cell.name}: excess of {found.excess_m_per_tick[1]:.3f} m per tick expected, {100 * found.retained:.0f} % of the effect survives"
