@@ -33,7 +33,6 @@ from nodes.experiment.plan.space_config import (
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.faces import PaintedScene, face_space, has_face
-from nodes.experiment.show.frames import DeployedFrames
 from nodes.experiment.show.light import light_on_panels
 from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import (
@@ -44,6 +43,7 @@ from nodes.experiment.show.objects import (
     surrogate_of,
 )
 from nodes.experiment.show.own_scene import display_of, mount_of, own_objects
+from nodes.experiment.show.standing import DeployedFrames
 from nodes.lab.located import content_sha256
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.runtime.errors import ConfigError

@@ -23,7 +23,7 @@ from advnerf_core.scene.surrogate import Surrogate
 from hardware.cameras.effects import CameraEffects
 from nodes.experiment.pages import report
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.plan.robustness_config import RobustnessConfig
+from nodes.experiment.plan.sections import RobustnessConfig
 from nodes.experiment.plan.victims import NAIVE
 from nodes.experiment.run.cells import run_cell, search_cell
 from nodes.experiment.show.context import Experiment

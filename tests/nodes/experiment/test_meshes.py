@@ -6,7 +6,7 @@ import pytest
 
 from advnerf_core.geometry import planar_pose
 from advnerf_core.objects.mesh.engine import MeshEngineError, engine
-from nodes.experiment.show.frames import DeployedFrames
+from nodes.experiment.show.standing import DeployedFrames
 
 
 @pytest.fixture(scope="module", autouse=True)

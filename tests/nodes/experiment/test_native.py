@@ -20,9 +20,9 @@ from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Surrogate
 from nodes.experiment.plan.placed import PlacedObject
 from nodes.experiment.show.deployed import DressedScene
-from nodes.experiment.show.frames import DeployedFrames
 from nodes.experiment.show.native import NativeScene
 from nodes.experiment.show.objects import placed_objects
+from nodes.experiment.show.standing import DeployedFrames
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from tests.support.remote.flat_world import FlatConfig, FlatWorld
