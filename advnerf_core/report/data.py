@@ -17,6 +17,7 @@ from advnerf_core.report.reference import Domain
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
+SHOWN_VIEWS = 6  # held-out views whose images a page shows
 _TICKS_COMPARED = (50, 400)  # horizons whose memory use is compared
 
 

@@ -11,13 +11,12 @@ from markupsafe import Markup
 from advnerf_core.report import maps, plots
 from advnerf_core.report.clips import Frames, image_uri
 from advnerf_core.report.conditions import style_of
-from advnerf_core.report.data import Drives, ReportData
+from advnerf_core.report.data import SHOWN_VIEWS, Drives, ReportData
 from advnerf_core.report.pages import HOW, MAX_EMBEDDED_BYTES, fits, fragments
 from advnerf_core.report.reference import DOMAINS
 from advnerf_core.report.result_table import ResultTable
 from advnerf_core.report.text_table import Table, number
 
-_SHOWN_VIEWS = 6
 _DIFFERENCE_GAIN = 4
 
 
@@ -111,7 +110,7 @@ def _views(data: ReportData) -> list[dict[str, Any]]:
     """Image pairs with their difference, of the first few views with images."""
     out: list[dict[str, Any]] = []
     for view in data.fidelity.views if data.fidelity else ():
-        if view.real is not None and view.surrogate is not None and len(out) < _SHOWN_VIEWS:
+        if view.real is not None and view.surrogate is not None and len(out) < SHOWN_VIEWS:
             images = view.real, view.surrogate, _difference(view.real, view.surrogate)
             out.append({"view": view, "images": [image_uri(each) for each in images]})
     return out

@@ -32,7 +32,6 @@ from nodes.experiment.steps.steering_gate import steering_of_victims
 from nodes.lab.trials import evaluation
 from nodes.runtime.machine import memory_gib, processor_name
 
-SHOWN_VIEWS = 6
 _PATH_POINTS = 400
 
 
@@ -244,7 +243,7 @@ def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
 def _fidelity(experiment: Experiment) -> rd.Fidelity:
     scene = read_json(experiment.stage_folder("scene") / FIDELITY)
     steering = steering_of_victims(experiment)[experiment.config.main_victim]
-    shown = {int(i) for i in np.linspace(0, len(scene["views"]) - 1, SHOWN_VIEWS).round()}
+    shown = {int(i) for i in np.linspace(0, len(scene["views"]) - 1, rd.SHOWN_VIEWS).round()}
     views = []
     for index, (view, angles) in enumerate(zip(scene["views"], steering, strict=True)):
         images = view_pictures(experiment, index) if index in shown else {}

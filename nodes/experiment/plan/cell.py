@@ -13,6 +13,8 @@ from nodes.runtime.errors import ConfigError
 
 # Keys of --only.
 KEYS = ("variant", "path", "victim", "method", "seed")
+# Share of a cell's work that is finished when only its drives are left.
+SEARCHED_SHARE = 0.9
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from advnerf_core.report.conditions import NONE
 from hardware.worlds.world import World
 from nodes.experiment.engine.artefact import ReferenceBuild
 from nodes.experiment.engine.stages import Stage, keep_stages
-from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.cell import SEARCHED_SHARE, Cell
 from nodes.experiment.plan.space_config import PlacesConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, over_the_world
@@ -25,8 +25,6 @@ from nodes.experiment.steps.live import LiveNodes
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.shared_search import take_search
 from nodes.runtime.progress import Report
-
-_SEARCHED = 0.9  # share of a cell's work
 
 
 class Bench:
@@ -89,7 +87,7 @@ def run_cell(
     with Bench(experiment) if bench is None else nullcontext(bench) as shared:
         clean = search_cell(experiment, cell, folder, report, shared)
         check_frozen(experiment, cell, folder)
-        tell = partial(report, _SEARCHED)
+        tell = partial(report, SEARCHED_SHARE)
         tell("driving")
         driven = clean if cell.method == NONE else folder
         data = cell_data(experiment, shared.space, shared.deployed_in, cell, driven, clean, tell)

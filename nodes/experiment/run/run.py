@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.cell import SEARCHED_SHARE, Cell
 from nodes.experiment.run.admission import past_the_gate
 from nodes.experiment.run.cells import Bench, needed_settings
 from nodes.experiment.run.plan import elsewhere, not_registered, plan_cells
@@ -31,8 +31,6 @@ Backend = Literal["local", "ray"]
 Say = Callable[[str], None]
 # How often cells are resubmitted after a whole machine of a cluster was lost.
 _ROUNDS = 3
-# Share of a cell's work that is finished when only its live drives are left.
-_SEARCHED = 0.9
 
 
 @dataclass(frozen=True)
@@ -172,7 +170,7 @@ def _run_on(
         if end.how == "done" and last:
             display.finish(name, seconds[name], cached=False)
         elif end.how == "done":
-            reports[name](_SEARCHED, "searched")
+            reports[name](SEARCHED_SHARE, "searched")
         return end
 
     if options.search_only:
