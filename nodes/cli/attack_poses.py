@@ -1,4 +1,4 @@
-"""The commands of ``advnerf attack`` about where objects stand: ``poses``, ``landscape`` and ``robustness``."""
+"""The commands of ``advnerf attack`` about where objects stand: ``landscape`` and ``robustness``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from nodes.cli.attack import Output
-from nodes.runtime.terminal import Overrides, print_table, table
+from nodes.runtime.terminal import Overrides
 
 RequestFile = Annotated[
     Path,
@@ -27,32 +27,6 @@ FoundAttack = Annotated[
         dir_okay=False,
     ),
 ]
-
-
-def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides = None) -> None:
-    """Search for where objects should stand, alone or with their colours; the same command resumes it after a kill."""
-    from advnerf_core.attack.artifact import load_attack
-    from nodes.experiment.node.poses import require_places
-    from nodes.experiment.node.prepare import load_request
-    from nodes.experiment.node.printed import print_attacks
-    from nodes.experiment.node.search import run_attack
-    from nodes.runtime.locks import hold_folder
-    from nodes.runtime.progress import ProgressDisplay
-
-    request = load_request(file, overrides or [], output)
-    require_places(request)
-    with hold_folder(request.folder), ProgressDisplay() as display:
-        files = run_attack(request, request.folder, display)
-    rows = table("attack", "object", "x [m]", "y [m]", "yaw [rad]", "scale", "predicted total CTE [m]")
-    for each in files:
-        attack = load_attack(each)
-        for k, found in enumerate(attack.objects):
-            total = f"{attack.predicted_total_cte_m:.1f}" if k == 0 else ""
-            rows.add_row(
-                attack.attack_id if k == 0 else "", str(k), *(f"{v:.3f}" for v in found.placement), total
-            )
-    print_table(rows)
-    print_attacks(files)
 
 
 def attack_landscape(

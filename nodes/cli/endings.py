@@ -20,7 +20,6 @@ _RESUMABLE = (
     ("experiment", "maps"),
     ("attack", "run"),
     ("attack", "resume"),
-    ("attack", "poses"),
     ("attack", "landscape"),
     ("attack", "robustness"),
     ("scene", "train"),

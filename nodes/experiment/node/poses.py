@@ -21,18 +21,6 @@ from nodes.experiment.steps.pose_maps import Mapped
 from nodes.runtime.errors import ConfigError
 
 
-def require_places(experiment: Experiment) -> None:
-    """Refuse a request that moves nothing.
-
-    Raises:
-        ConfigError: The request moves nothing.
-    """
-    if not isinstance(experiment.config.space, PlacesConfig):
-        raise ConfigError(
-            f"{experiment.file}: expected space.kind places, with bounds of each object; see docs/poses.md"
-        )
-
-
 def draw_found(prepared: Prepared, attack: AttackFile) -> bytes:
     """A picture of the found places, and of the drives with and without them."""
     space, problem = prepared.space, prepared.problem.undisturbed()
@@ -52,7 +40,7 @@ def mapped(experiment: Experiment, attack: Path | None) -> Mapped:
         AttackFileError: The file has other objects.
         PoseBoundsError: The objects stand outside their bounds.
     """
-    require_places(experiment)
+    _require_places(experiment)
     prepared = prepare(experiment)
     space = prepared.space
     assert isinstance(space, PlaceSpace), "the space of places is this one"
@@ -60,6 +48,18 @@ def mapped(experiment: Experiment, attack: Path | None) -> Mapped:
     digest = hash_of([prepared.settings_hash, "" if found is None else found.sha256])
     theta = _plain(space) if found is None else _theta_of(space, found, str(attack))
     return Mapped(prepared.problem, theta, digest, "" if found is None else "found")
+
+
+def _require_places(experiment: Experiment) -> None:
+    """Refuse a request that moves nothing.
+
+    Raises:
+        ConfigError: The request moves nothing.
+    """
+    if not isinstance(experiment.config.space, PlacesConfig):
+        raise ConfigError(
+            f"{experiment.file}: expected space.kind places, with bounds of each object; see docs/poses.md"
+        )
 
 
 def _placements(attack: AttackFile) -> Tensor:

@@ -43,7 +43,7 @@ def command(monkeypatch, *words):
 def test_commands_search_map_and_find_their_work_again(tmp_path, monkeypatch, capsys):
     file, folder = request_file(tmp_path), tmp_path / "out"
     attack_path = folder / "seed_0.attack.safetensors"
-    assert command(monkeypatch, "poses", file, "-o", folder) == 0
+    assert command(monkeypatch, "run", file, "-o", folder) == 0
     attack, content = load_attack(attack_path), attack_path.read_bytes()
     (found,) = attack.objects
     placement = found.placement
@@ -62,7 +62,7 @@ def test_commands_search_map_and_find_their_work_again(tmp_path, monkeypatch, ca
         assert (folder / f"{name}.png").stat().st_size > 1000
     assert len(json.loads((folder / "landscape.json").read_text())["cells"]) == 4
     assert np.array(json.loads((folder / "robustness.json").read_text())["cells"]["1"]).shape == (3, 2)
-    assert command(monkeypatch, "poses", file, "-o", folder) == 0
+    assert command(monkeypatch, "run", file, "-o", folder) == 0
     assert attack_path.read_bytes() == content
     capsys.readouterr()
     # Another question in the same folder is refused in one line.
@@ -143,10 +143,10 @@ def test_a_request_that_cannot_be_is_refused(tmp_path, bounds, changes, what):
 
 
 def test_a_request_without_poses_and_bounds_on_the_lane_end_in_one_line(tmp_path, monkeypatch, capsys):
-    assert command(monkeypatch, "poses", tiny_request(tmp_path / "plain"), "-o", tmp_path / "a") == 2
+    assert command(monkeypatch, "landscape", tiny_request(tmp_path / "plain"), "-o", tmp_path / "a") == 2
     assert "expected space.kind places" in capsys.readouterr().err
     on_lane = request_file(tmp_path / "lane", BOUNDS.replace("[-1.5, -1.2]", "[-2.1, -1.9]"))
-    assert command(monkeypatch, "poses", on_lane, "-o", tmp_path / "b") == 2
+    assert command(monkeypatch, "run", on_lane, "-o", tmp_path / "b") == 2
     said = capsys.readouterr().err
     assert "expected bounds with a place at least 0.3 m beside the path" in said
     assert "Traceback" not in said
