@@ -29,6 +29,7 @@ from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.load import load_any_policy
 from advnerf_core.policies.onnx_policy import export_onnx
 from advnerf_core.report.audit_result import AuditResult, read_audit
+from advnerf_core.report.clips import write_video
 from benchmarks.results import REPOSITORY, record_row
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
@@ -41,7 +42,6 @@ from nodes.audit.learning import OTHER_HALF
 from nodes.audit.question import FILE
 from nodes.audit.verdict import effect_of
 from nodes.experiment.steps.run import load_experiment
-from nodes.lab.scene_training import write_video
 from tests.support.lab_photographs import photograph
 
 COMMAND = "python -m benchmarks.own_place"

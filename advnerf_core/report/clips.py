@@ -9,7 +9,7 @@ import base64
 import io
 import os
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
@@ -87,7 +87,8 @@ def write_clip(
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{suffix}")
     try:
         for quality in _QUALITIES:
-            _encode(temporary, codec, quality, rate_hz, compose(tracks, rate_hz, off_track_m))
+            frames = compose(tracks, rate_hz, off_track_m)
+            _encode(temporary, codec, rate_hz, frames, _small(codec, quality))
             size = temporary.stat().st_size
             if size <= MAX_BYTES:
                 os.replace(temporary, path)
@@ -104,6 +105,18 @@ def write_film(path: Path, tracks: Sequence[ClipTrack], rate_hz: float, off_trac
     file = write_clip(path, tracks, rate_hz, off_track_m)
     moment = int(np.abs(np.asarray(tracks[-1].cte_m)).argmax())
     return Film(file, tuple(each.title for each in tracks), moment)
+
+
+def write_video(path: Path, frames: Iterable[Frames], rate_hz: float = 10.0) -> Path:
+    """Write images ``[H, W, 3]`` of uint8 RGB as an H.264 video in MP4. The file appears when it is complete."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
+    try:
+        _encode(temporary, "libx264", rate_hz, frames, {})
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
 
 
 def compose(tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: float = 0.4) -> Iterator[Frames]:
@@ -158,13 +171,17 @@ def frame_of(path: Path, number: int) -> Frames:
     return frame
 
 
-def _encode(path: Path, codec: str, quality: int, rate_hz: float, frames: Iterator[Frames]) -> None:
-    options = {"crf": str(quality)}
-    options |= (
-        {"preset": "slow", "tune": "animation"}
-        if codec == "libx264"
-        else {"b": "0", "deadline": "good", "cpu-used": "3"}
-    )
+def _small(codec: str, quality: int) -> dict[str, str]:
+    """The encoder's options for a small file."""
+    if codec == "libx264":
+        return {"crf": str(quality), "preset": "slow", "tune": "animation"}
+    return {"crf": str(quality), "b": "0", "deadline": "good", "cpu-used": "3"}
+
+
+def _encode(
+    path: Path, codec: str, rate_hz: float, frames: Iterable[Frames], options: dict[str, str]
+) -> None:
+    """Encode images; of an odd size without their last row or column, as 4:2:0 video has even sides."""
     # With the index in front a page can play the clip while it loads.
     container_options = {"movflags": "+faststart"} if path.suffix == ".mp4" else {}
     with av.open(str(path), "w", options=container_options) as container:
@@ -172,9 +189,10 @@ def _encode(path: Path, codec: str, quality: int, rate_hz: float, frames: Iterat
         for frame in frames:
             if stream is None:
                 stream = container.add_stream(codec, rate=round(rate_hz), options=options)
-                stream.height, stream.width = frame.shape[:2]
+                stream.height, stream.width = (side - side % 2 for side in frame.shape[:2])
                 stream.pix_fmt = "yuv420p"
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+            even = np.ascontiguousarray(frame[: stream.height, : stream.width])
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
         container.mux(stream.encode(None))
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +17,7 @@ from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.files import write_atomically, write_json
 from advnerf_core.geometry import Array
 from advnerf_core.render.march import MarchConfig
+from advnerf_core.report.clips import write_video
 from advnerf_core.scene.auto_box import box_around_cameras, box_of_silhouettes
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
@@ -42,7 +41,6 @@ SCENE, CHECKPOINT, FIGURES, EXPOSURE = (
 MM_PER_M = 1000.0
 _NO_TIME_LIMIT_STEPS = 1_000_000
 _WHITE = (1.0, 1.0, 1.0)
-_VIDEO_FPS = 10
 _MEASURES = ("psnr_db", "gain_fitted_psnr_db", "ssim")
 
 
@@ -163,25 +161,6 @@ def depth_in_mm(depth_m: Array) -> NDArray[np.uint16]:
 def rendered_files(listed: PosedImages, output: Path) -> list[Path]:
     """Files of the colour images that `render` writes, in the order of the images."""
     return [output / f"{index:04d}_{frame.path.stem}.png" for index, frame in enumerate(listed.frames)]
-
-
-def write_video(path: Path, frames: Sequence[NDArray[np.uint8]]) -> None:
-    """Write images ``[H, W, 3]`` as an H.264 video. The file appears when it is complete."""
-    partial = path.with_name(path.name + ".part")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with av.open(str(partial), "w", format="mp4") as container:
-            stream = container.add_stream("libx264", rate=_VIDEO_FPS)
-            # H.264 needs even sizes.
-            stream.height, stream.width = (side - side % 2 for side in frames[0].shape[:2])
-            stream.pix_fmt = "yuv420p"
-            for picture in frames:
-                even = np.ascontiguousarray(picture[: stream.height, : stream.width])
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
-            container.mux(stream.encode())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def scene_field(

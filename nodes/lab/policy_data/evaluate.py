@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from advnerf_core.data.image_files import write_image
 from advnerf_core.driving.rollout import Remembering
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.frames import HOLDOUT_BLOCK
+from advnerf_core.report.clips import write_video
 from nodes.lab.policy_data.frames import HOLDOUT_EVERY, RecordedFrames, held_out
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError
@@ -202,25 +203,17 @@ def write_saliency(
         files.append(out / f"saliency_{index:05d}.png")
         write_image(files[-1], both)
     if video:
-        files.append(_write_video(policy, images, out / "saliency.mp4", goal))
+        files.append(write_video(out / "saliency.mp4", _filmed(policy, images, goal)))
     return files
 
 
-def _write_video(policy: Any, images: NDArray[np.uint8], path: Path, goal: tuple[float, ...]) -> Path:
-    height, width = images.shape[1] * 2, images.shape[2]
-    partial = path.with_name(f".{path.stem}.partial.mp4")
-    size = (width * _VIDEO_SCALE, height * _VIDEO_SCALE)
-    writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, size)
-    if not writer.isOpened():
-        raise ConfigError(f"this OpenCV cannot write {path}; remove --video (the PNG files are written)")
+def _filmed(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...]) -> Iterator[NDArray[np.uint8]]:
+    """Each image above its saliency, enlarged."""
     for start in range(0, len(images), _BATCH):
         batch = images[start : start + _BATCH]
         for image, share in zip(batch, saliency(policy, batch, goal), strict=True):
             both = np.concatenate([image, overlay(image, share)])
-            writer.write(cv2.resize(both, size, interpolation=cv2.INTER_NEAREST)[..., ::-1])
-    writer.release()
-    partial.replace(path)
-    return path
+            yield both.repeat(_VIDEO_SCALE, axis=0).repeat(_VIDEO_SCALE, axis=1)
 
 
 def _tensor(images: NDArray[np.uint8]) -> torch.Tensor:

@@ -1,3 +1,4 @@
+import av
 import numpy as np
 import pytest
 
@@ -66,3 +67,20 @@ def test_the_poster_of_a_film_is_where_the_last_drive_is_farthest_from_its_path(
     written = clips.read_clip(film.file)
     np.testing.assert_array_equal(clips.frame_of(film.file, film.moment), written[3])
     np.testing.assert_array_equal(clips.frame_of(film.file, 99), written[-1])
+
+
+def test_a_video_is_h264_of_even_size_and_appears_when_it_is_complete(tmp_path):
+    frames = np.full((4, 41, 64, 3), 200, np.uint8)
+    path = clips.write_video(tmp_path / "new" / "v.mp4", iter(frames))
+    assert [each.name for each in path.parent.iterdir()] == ["v.mp4"]
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+    assert np.abs(clips.read_clip(path).astype(float) - frames[:, :40]).max() < 8
+
+    def broken():
+        yield frames[0]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        clips.write_video(tmp_path / "new" / "w.mp4", broken())
+    assert [each.name for each in path.parent.iterdir()] == ["v.mp4"]

@@ -2,7 +2,9 @@
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
 from nodes.lab.policy_data import train as training
-from nodes.lab.policy_data.evaluate import compare, predict, saliency
+from nodes.lab.policy_data.evaluate import compare, predict, saliency, write_saliency
 from nodes.lab.policy_data.frames import frames_of, view_for_size, view_of
 from nodes.lab.policy_data.logs import OpenLog, open_log
 from nodes.lab.policy_data.recordings import crop_notes, policy_view, recorded_frames
@@ -161,6 +163,17 @@ def test_saliency_is_where_the_gradient_is():
     assert np.unravel_index(maps[1].argmax(), (66, 200)) == (20, 150)
     assert maps.max() == pytest.approx(1.0)
     assert maps[:, 40:].max() == 0.0
+
+
+def test_the_video_of_saliency_plays_in_a_browser(tmp_path):
+    images = np.full((3, 66, 200, 3), 90, np.uint8)
+    recording = SimpleNamespace(frames=SimpleNamespace(images=images))
+    files = write_saliency(lambda images, goals: images.mean((1, 2, 3)), recording, tmp_path, 0, video=True)
+    assert files == [tmp_path / "saliency.mp4"]
+    with av.open(str(files[0])) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.frames) == ("h264", 3)
+        assert (stream.height, stream.width) == (4 * 2 * 66, 4 * 200)
 
 
 def test_a_policy_of_several_images_is_compared_in_the_order_of_the_recording():
