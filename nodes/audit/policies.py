@@ -19,6 +19,7 @@ from advnerf_core.policies.declaration import DECLARATION_SUFFIX
 from advnerf_core.policies.guess import Question, guess_contract
 from advnerf_core.policies.load import is_address, is_code, load_any_policy, wrong_policy
 from advnerf_core.policies.onnx_policy import read_onnx
+from nodes.runtime.config import typed_values
 from nodes.runtime.errors import ConfigError
 
 FOLDER = "policy"
@@ -54,7 +55,8 @@ def resolve_policy(
         raise ConfigError(wrong_policy(given))
     contract, questions = guess_contract(file)
     if questions or declared:
-        contract = _completed(contract, questions, _read(declared), driven, say)
+        answers = typed_values("--declare", declared, "colour_space=BGR")
+        contract = _completed(contract, questions, answers, driven, say)
         target = folder / FOLDER / file.name
         _copy(file, target)
         write_atomically(target.with_name(target.name + DECLARATION_SUFFIX), dump_yaml(contract.to_dict()))
@@ -84,16 +86,6 @@ def _completed(
     if values.get("output_unit") == "normalised" and values.get("full_steering_rad") is None:
         values["full_steering_rad"] = driven()[1]
     return PolicyContract.from_dict(values, "--declare")
-
-
-def _read(declared: Sequence[str]) -> dict[str, Any]:
-    found = {}
-    for text in declared:
-        key, separator, value = text.partition("=")
-        if not separator:
-            raise ConfigError(f"--declare {text}: expected KEY=VALUE, for example --declare colour_space=BGR")
-        found[key.strip()] = parse_yaml(value, f"--declare {text}").data
-    return found
 
 
 def _whole_picture(view: Mapping[str, Any], camera: Pinhole) -> dict[str, Any]:

@@ -237,15 +237,13 @@ def bag_play(
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:
+    from nodes.runtime.config import key_and_value
     from nodes.runtime.errors import BagError
 
     pairs: dict[str, str] = {}
     for text in texts:
-        old, separator, new = text.partition(":=")
-        if not separator or not old or not new:
-            raise BagError(
-                f"--remap {text}: expected OLD:=NEW, for example /camera/image_raw:=/compositor/image"
-            )
+        example = "/camera/image_raw:=/compositor/image"
+        old, new = key_and_value("--remap", text, example, "OLD:=NEW", ":=", needs_value=True)
         if old in pairs:
             raise BagError(
                 f"--remap {text}: expected one new name per topic; {old} is already remapped to {pairs[old]}. Remove one of the two"

@@ -281,18 +281,10 @@ def _error_cells(e: Errors) -> list[str]:
 
 def _architecture(name: str, configuration: list[str]) -> Architecture:
     """The architecture with its settings, checked before recordings are read."""
-    from advnerf_core.documents import parse_yaml
     from advnerf_core.policies.architecture import Architecture, require_architecture
-    from nodes.runtime.errors import ConfigError
+    from nodes.runtime.config import typed_values
 
-    settings = {}
-    for text in configuration:
-        key, separator, value = text.partition("=")
-        if not separator:
-            raise ConfigError(
-                f"--configuration {text}: expected KEY=VALUE, for example --configuration 'widths=[16, 32]'"
-            )
-        settings[key.strip()] = parse_yaml(value, f"--configuration {text}").data
+    settings = typed_values("--configuration", configuration, "'widths=[16, 32]'")
     require_architecture(name, None, settings)
     found = Architecture(name, settings)
     found.check()

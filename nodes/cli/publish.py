@@ -61,6 +61,7 @@ def publish(
     from nodes.experiment.run.published import publish_build
     from nodes.experiment.run.set_film import write_film
     from nodes.experiment.run.store import NOT_DRIVEN
+    from nodes.runtime.config import key_and_value
     from nodes.runtime.errors import ConfigError
 
     experiment, cells = load_cells(choice)
@@ -75,10 +76,15 @@ def publish(
     if withdraw:
         finished = {each.cell.name for each in found_here if each.state == "done"}
         registration.withdraw(
-            to / experiment.config.name, dict(_scenario_and_reason(each) for each in withdraw), finished
+            to / experiment.config.name,
+            dict(key_and_value("--withdraw", each, "left=REASON", "NAME=REASON") for each in withdraw),
+            finished,
         )
     if declare:
-        victims.declare(to / experiment.config.name, dict(_scenario_and_reason(each) for each in declare))
+        reasons = dict(
+            key_and_value("--declare", each, "left.own=REASON", "NAME.VICTIM=REASON") for each in declare
+        )
+        victims.declare(to / experiment.config.name, reasons)
     for each in found_here:
         if each.state == NOT_DRIVEN:
             say_error(
@@ -109,11 +115,6 @@ def publish(
             "are removed" if prune else "stay, until --prune removes them"
         )
         print(f"{len(found.stale)} of those there {what}: {', '.join(found.stale)}")
-
-
-def _scenario_and_reason(text: str) -> tuple[str, str]:
-    scenario, _, reason = text.partition("=")
-    return scenario, reason
 
 
 def _say_build(build: PublishedBuild) -> None:

@@ -91,15 +91,16 @@ def replay(
 
 def _choice(nodes: str, replace: list[str], launch: Path | None, policy: str, overrides: list[str]) -> Choice:
     from nodes.replaying.nodes import Choice
+    from nodes.runtime.config import key_and_value
     from nodes.runtime.errors import BagError
 
     names = tuple(dict.fromkeys(name.strip() for name in nodes.split(",") if name.strip()))
     replacements = {}
     for text in replace:
-        name, separator, module = text.partition("=")
-        if not separator or not name.strip() or not module.strip():
-            raise BagError(f"--replace {text}: expected NODE=MODULE or NODE=MODULE:CLASS")
-        replacements[name.strip()] = module.strip()
+        name, module = key_and_value(
+            "--replace", text, "policy=my_policy:Node", "NODE=MODULE or NODE=MODULE:CLASS", needs_value=True
+        )
+        replacements[name] = module.strip()
     if policy:
         if "policy" not in names:
             raise BagError(

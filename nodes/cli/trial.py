@@ -141,13 +141,17 @@ def _added(compared: dict[str, Any] | None) -> str:
 
 def _attacks(texts: list[str]) -> dict[str, list[Path]]:
     from nodes.lab.trials.plan import NONE, CampaignError
+    from nodes.runtime.config import key_and_value
 
     attacks: dict[str, list[Path]] = {}
     for text in texts:
-        condition, separator, file = text.partition("=")
-        if not separator or not condition.replace("_", "").isalnum() or condition == NONE or not file:
+        condition, file = key_and_value(
+            "--attack", text, "gradient=runs/g.safetensors", "CONDITION=FILE", needs_value=True
+        )
+        if not condition.replace("_", "").isalnum() or condition == NONE:
             raise CampaignError(
-                f"--attack {text}: expected CONDITION=FILE, for example gradient=runs/g.safetensors"
+                f"--attack {text}: expected a condition of letters and digits other than {NONE}, got {condition!r}; name it"
+                " as in gradient=runs/g.safetensors"
             )
         attacks.setdefault(condition, []).append(Path(file).resolve())
     return attacks

@@ -15,15 +15,46 @@ M = TypeVar("M")
 _NONE = ("", "null", "Null", "NULL", "~")
 
 
+def key_and_value(
+    option: str,
+    text: str,
+    example: str,
+    form: str = "KEY=VALUE",
+    separator: str = "=",
+    needs_value: bool = False,
+) -> tuple[str, str]:
+    """Both sides of the text of an option, the value as it was written.
+
+    Args:
+        form: What is expected, for the error.
+        needs_value: Whether an empty value is refused, too; an empty key always is.
+
+    Raises:
+        ConfigError: The text has another form.
+    """
+    key, found, value = text.partition(separator)
+    if not found or not key.strip() or (needs_value and not value.strip()):
+        raise ConfigError(f"{option} {text}: expected {form}, for example {option} {example}")
+    return key.strip(), value
+
+
+def typed_values(option: str, texts: Iterable[str], example: str) -> dict[str, Any]:
+    """The values of ``KEY=VALUE`` texts of an option, which are YAML."""
+    pairs = [(text, *key_and_value(option, text, example)) for text in texts]
+    return {key: _value_of(value, f"{option} {text}") for text, key, value in pairs}
+
+
+def _value_of(text: str, source: str) -> Any:
+    """The YAML value of a text; None if it is empty or null, where an empty file has no keys."""
+    return parse_yaml(text, source).data if text.strip() not in _NONE else None
+
+
 def apply_overrides(document: Document, overrides: Iterable[str], prefix: Key = ()) -> None:
     """Apply ``key.of.it=value`` overrides in place. Values are YAML, and keys are relative to ``prefix``."""
     for text in overrides:
-        name, separator, value = text.partition("=")
-        if not separator or not name.strip():
-            raise ConfigError(f"--set {text}: expected KEY=VALUE, for example --set camera.rate_hz=10")
-        key: Key = (*prefix, *name.strip().split("."))
-        # An empty file has no keys. An empty value, or null, is None.
-        parsed = parse_yaml(value, f"--set {text}").data if value.strip() not in _NONE else None
+        name, value = key_and_value("--set", text, "camera.rate_hz=10")
+        key: Key = (*prefix, *name.split("."))
+        parsed = _value_of(value, f"--set {text}")
         target = document.data
         for number, step in enumerate(key, start=1):
             if not isinstance(target, dict):

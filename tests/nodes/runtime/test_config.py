@@ -9,7 +9,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from advnerf_core.documents import parse_yaml
 from advnerf_core.places import PlaceError, private_folder
 from nodes.launching.launch_file import load_launch
-from nodes.runtime.config import apply_overrides, load_config, load_node_config, node_document
+from nodes.runtime.config import (
+    apply_overrides,
+    key_and_value,
+    load_config,
+    load_node_config,
+    node_document,
+    typed_values,
+)
 from nodes.runtime.errors import BusError, ConfigError
 from nodes.runtime.paths import bus_folder, named_file, shipped, user_folder
 
@@ -108,6 +115,22 @@ def test_missing_file_is_a_config_error(tmp_path):
 def test_wrong_override_names_itself(tmp_path, override, message):
     with pytest.raises(ConfigError, match=message):
         load_config(Camera, write(tmp_path, "name: a\n"), [override])
+
+
+def test_values_by_name_are_yaml_and_a_text_without_a_name_says_the_form():
+    assert typed_values("--declare", ["a= [1, 2]", "b=null", " c =x=y"], "a=1") == {
+        "a": [1, 2],
+        "b": None,
+        "c": "x=y",
+    }
+    for text in ("a", "=1"):
+        with pytest.raises(
+            ConfigError, match=f"--declare {text}: expected KEY=VALUE, for example --declare a=1"
+        ):
+            typed_values("--declare", [text], "a=1")
+    assert key_and_value("--remap", "/a:=/b", "/a:=/b", "OLD:=NEW", ":=") == ("/a", "/b")
+    with pytest.raises(ConfigError, match=r"--attack none=: expected CONDITION=FILE"):
+        key_and_value("--attack", "none=", "a=b", "CONDITION=FILE", needs_value=True)
 
 
 LAUNCH = "nodes:\n  cam:\n    config:\n      name: a\n      rat: 3\n"
