@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from nodes.runtime.options import with_groups
-from nodes.runtime.terminal import print_table, table
+from nodes.runtime.terminal import numbers_of, print_table, table
 
 if TYPE_CHECKING:
     from advnerf_core.attack.artifact import AttackFile
@@ -166,19 +165,15 @@ def attack_measure(
 
 def _pose(text: str | None) -> tuple[float, float, float] | None:
     from advnerf_core.strict import within_a_turn
-    from calibration.schema import CalibrationError
+    from nodes.runtime.errors import ConfigError
 
     if text is None:
         return None
+    x_m, y_m, yaw_rad = numbers_of("--car", text, 3, "X,Y,YAW in metres and radians", "1.2,-0.4,3.1")
     try:
-        x_m, y_m, yaw_rad = map(float, text.split(","))
-        if not all(map(math.isfinite, (x_m, y_m, within_a_turn(yaw_rad)))):
-            raise ValueError("expected finite numbers")
-    except ValueError:
-        raise CalibrationError(
-            f"expected --car X,Y,YAW in m and rad, such as 1.2,-0.4,3.1; got {text!r}"
-        ) from None
-    return x_m, y_m, yaw_rad
+        return x_m, y_m, within_a_turn(yaw_rad)
+    except ValueError as error:
+        raise ConfigError(f"--car {text}: {error}") from None
 
 
 def _effect(request: Path, attack: AttackFile, record: PrintRecord, found: MeasuredPrint) -> PrintEffect:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes.runtime.terminal import RunDir, print_table, say_error, table
+from nodes.runtime.terminal import RunDir, numbers_of, print_table, say_error, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -164,7 +164,7 @@ def room_target(
         )
     refuse_overwriting([bag], [output])
     if size is not None:
-        width, height = _numbers(size.replace("x", ","), 2, "--face-size")
+        width, height = numbers_of("--face-size", size.replace("x", ","), 2, "in metres", "0.598x0.336")
         target = target_of_size(
             subject,
             (width, height),
@@ -312,20 +312,6 @@ def _draw(figure: Figure, room: RoomCalibration, trace: Array, fit: PathFit | No
         )
 
 
-def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:
-    from calibration.schema import CalibrationError
-
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != count:
-        raise CalibrationError(
-            f"{option} {text}: expected {count} numbers in metres, for example {'0.598x0.336' if count == 2 else '0,0,0.1'}"
-        )
-    return values
-
-
 def _point(text: str, option: str) -> tuple[float, float, float]:
-    x, y, z = _numbers(text, 3, option)
+    x, y, z = numbers_of(option, text, 3, "in metres", "0,0,0.1")
     return x, y, z

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes.runtime.terminal import LaunchFile, Overrides, print_table, table
+from nodes.runtime.terminal import LaunchFile, Overrides, numbers_of, print_table, table
 
 if TYPE_CHECKING:
     from nodes.lab.trials.plan import PlannedDrive
@@ -158,15 +158,8 @@ def _attacks(texts: list[str]) -> dict[str, list[Path]]:
 
 
 def _pose(text: str) -> tuple[float, float, float]:
-    from nodes.lab.trials.plan import CampaignError
-
-    try:
-        x, y, yaw = (float(part) for part in text.split(","))
-    except ValueError:
-        raise CampaignError(
-            f"--start {text}: expected X,Y,YAW in metres and radians, for example -1.1,-2.0,0"
-        ) from None
-    return x, y, yaw
+    x_m, y_m, yaw_rad = numbers_of("--start", text, 3, "X,Y,YAW in metres and radians", "-1.1,-2.0,0")
+    return x_m, y_m, yaw_rad
 
 
 def _print_summary(summary: list[dict[str, Any]]) -> None:

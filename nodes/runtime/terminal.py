@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Sequence
@@ -103,6 +104,19 @@ def listen_address(text: str) -> tuple[str, int]:
             f"expected HOST:PORT to listen on, got {text}; write a port of at most {_LAST_PORT}"
         )
     return found[1], int(found[2])
+
+
+def numbers_of(option: str, text: str, count: int, form: str, example: str) -> tuple[float, ...]:
+    """The finite numbers of a text such as ``X,Y,YAW``; anything else raises `ConfigError`."""
+    try:
+        values = tuple(map(float, text.split(",")))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise ConfigError(
+            f"{option} {text}: expected {count} finite numbers {form}, for example {option} {example}"
+        )
+    return values
 
 
 def table(*columns: str) -> Table:

@@ -242,9 +242,10 @@ def test_a_drive_gives_size_pose_flatness_and_the_effect_where_it_hangs(call, se
 
 
 def test_a_yaw_in_degrees_is_refused(call, measuring):
-    for car in ("1,2,90", "1,nan,0", "inf,2,0"):
+    numbers = "3 finite numbers X,Y,YAW in metres and radians"
+    for car, wanted in (("1,2,90", "radians, at most a turn"), ("1,nan,0", numbers), ("inf,2,0", numbers)):
         code, said = call(*measuring, "--car", car)
-        assert (code, "in m and rad" in said) == (2, True), said
+        assert (code, f"--car {car}: expected {wanted}" in said) == (2, True), said
     for option in ("--width", "--distance"):  # Python reads it as a number
         code, said = call(*measuring, option, "inf")
         assert (code, f"expected finite numbers for {option}, got inf" in said) == (2, True), said

@@ -208,7 +208,7 @@ def test_targets_by_ruler_and_bad_options(tmp_path):
     done = advnerf(
         "scene", "room", "target", "-o", tmp_path / "n.yaml", "--subject", "monitor", "--face-size", "27"
     )
-    assert (done.returncode, "expected 2 numbers in metres" in done.stderr) == (2, True)
+    assert (done.returncode, "expected 2 finite numbers in metres" in done.stderr) == (2, True)
 
 
 @pytest.mark.parametrize(

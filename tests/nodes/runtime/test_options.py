@@ -23,6 +23,26 @@ def test_infinite_numbers_are_refused_with_the_option(tmp_path, monkeypatch, cap
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "car trial two_hosts --folder {folder}/trial --start nan,0,0",
+        "car trial two_hosts --folder {folder}/trial --start 0,0,inf",
+        "car trial two_hosts --folder {folder}/trial --start 0,0",
+        "scene room target -o {folder}/m.yaml --subject monitor --face-size 0.6x0.3 --centre inf,0,0",
+        "scene room target -o {folder}/m.yaml --subject monitor --face-size nan,0.3",
+        "scene room target -o {folder}/m.yaml --subject monitor --face-size 0.6",
+    ],
+)
+def test_poses_points_and_sizes_that_are_not_finite_are_refused(tmp_path, monkeypatch, capsys, words):
+    given = words.format(folder=tmp_path).split()
+    assert advnerf(monkeypatch, *given) == 2
+    said = capsys.readouterr().err
+    assert f"{given[-2]} {given[-1]}: expected " in said
+    assert "finite numbers" in said
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("listen", ["localhost:99999", "127.0.0.1:65536"])
 def test_a_port_that_does_not_exist_is_refused(listen):
     """viser said that it serves there."""
