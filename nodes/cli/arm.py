@@ -10,10 +10,9 @@ from typing import Annotated
 import typer
 
 from nodes.cli.stop import stop
-from nodes.runtime.terminal import RunDir
+from nodes.runtime.terminal import FAILURE_EXIT, RunDir
 
 Reason = Annotated[str, typer.Option("--reason", help="Reason to record.")]
-_FAILURE_EXIT = 1
 
 
 def arm(run_dir: RunDir = None, reason: Reason = "") -> None:
@@ -34,7 +33,7 @@ def arm(run_dir: RunDir = None, reason: Reason = "") -> None:
         print(f"armed by {answer.text}")
         return
     print(f"armed, but stopped again since: {answer.text}" if answer.granted else f"not armed: {answer.text}")
-    raise typer.Exit(_FAILURE_EXIT)
+    raise typer.Exit(FAILURE_EXIT)
 
 
 def disarm(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nodes.runtime.terminal import Device, Overrides, print_table, table
+from nodes.runtime.terminal import Device, Overrides, fail_unless, print_table, table
 
 if TYPE_CHECKING:
     from nodes.experiment.show.context import Experiment
@@ -162,5 +162,4 @@ def attack_check(
     for line in found.verdict:
         print(line)
     print(f"written: {', '.join(map(str, write_check(found, request.folder)))}")
-    if not found.sound:
-        raise typer.Exit(1)
+    fail_unless(found.sound)

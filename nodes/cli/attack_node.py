@@ -8,9 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from nodes.cli.attack import RequestFile
-from nodes.runtime.terminal import Overrides, RunDir
-
-_FAILURE_EXIT = 1
+from nodes.runtime.terminal import Overrides, RunDir, fail_unless
 
 
 def attack_request(
@@ -42,8 +40,7 @@ def attack_request(
             print(in_words(progress), flush=True)
 
     last = ask_for_attack(find_run_dir(run_dir), request_text(request), name, tell, follow)
-    if last.state in ("failed", "refused", "cancelled"):
-        raise typer.Exit(_FAILURE_EXIT)
+    fail_unless(last.state not in ("failed", "refused", "cancelled"))
 
 
 def attack_cancel(

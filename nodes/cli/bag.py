@@ -10,7 +10,7 @@ import typer
 
 from nodes.cli.replay import replay
 from nodes.cli.trial import evaluate
-from nodes.runtime.terminal import RunDir, Topics, print_table, say_error, table
+from nodes.runtime.terminal import RunDir, Topics, fail_unless, print_table, say_error, table
 
 if TYPE_CHECKING:
     from nodes.bags.info import BagInfo
@@ -266,8 +266,7 @@ def bag_control(
     PlayerCommand.parse(text)
     granted, answer = ask_player(find_run_dir(run_dir), text)
     print(answer if granted else f"not done: {answer}")
-    if not granted:
-        raise typer.Exit(1)
+    fail_unless(granted)
 
 
 @app.command("repair")

@@ -7,9 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from nodes.runtime.terminal import Overrides, print_findings
+from nodes.runtime.terminal import Overrides, fail_unless, print_findings
 
-_FAILURE_EXIT = 1
 app = typer.Typer(
     no_args_is_help=True, help="Find cameras, test them, and import the factory calibration of a ZED."
 )
@@ -93,8 +92,7 @@ def camera_check(
         if output is not None and bench.seen:
             write_image(output, bench.seen[-1].rgb)
             print(f"saved {output}")
-    if not met:
-        raise typer.Exit(_FAILURE_EXIT)
+    fail_unless(met)
 
 
 @app.command("factory")

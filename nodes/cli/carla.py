@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nodes.runtime.terminal import Overrides, print_findings, print_table, table
+from nodes.runtime.terminal import Overrides, fail_unless, print_findings, print_table, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ ConfigFile = Annotated[
         "--config", help="YAML file of a CarlaConfig; values not in it have their defaults.", exists=True
     ),
 ]
-FAILURE_EXIT = 1
 
 
 @app.command("check")
@@ -55,8 +54,7 @@ def carla_check(
 
     with ends_in_order():
         checks = check_server(_config(config, overrides, host, port), pictures=pictures)
-    if not print_findings(checks, "check"):
-        raise typer.Exit(FAILURE_EXIT)
+    fail_unless(print_findings(checks, "check"))
 
 
 @app.command("junctions")

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nodes.runtime.terminal import Overrides, launch_argument
+from nodes.runtime.terminal import Overrides, fail_unless, launch_argument
 
 if TYPE_CHECKING:
     from nodes.lab.doctor.check import CheckResult, DoctorCheck
 
 _COLOURS = {"ok": "green", "absent": "bright_black", "warning": "yellow", "failure": "red"}
-_FAILURE_EXIT = 1
 
 
 def doctor(
@@ -57,8 +56,7 @@ def doctor(
     if gpu:
         from nodes.lab.doctor.gpu import compare_gpu
 
-        if not compare_gpu(gpu_device, typer.echo):
-            raise typer.Exit(_FAILURE_EXIT)
+        fail_unless(compare_gpu(gpu_device, typer.echo))
         return
     from nodes.lab.doctor.check import FAILURE, examine, worst
 
@@ -73,8 +71,7 @@ def doctor(
     else:
         counts = {word: sum(finding.state == word for finding in findings) for word in ("failure", "warning")}
         print(", ".join(f"{count} {word}{'s' * (count != 1)}" for word, count in counts.items()))
-    if state == FAILURE:
-        raise typer.Exit(_FAILURE_EXIT)
+    fail_unless(state != FAILURE)
 
 
 def _checks(

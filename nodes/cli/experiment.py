@@ -18,7 +18,7 @@ from nodes.cli.publish import publish
 from nodes.cli.register import register
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.options import with_groups
-from nodes.runtime.terminal import Device, say_error
+from nodes.runtime.terminal import Device, fail_unless, say_error
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
@@ -40,7 +40,6 @@ app = typer.Typer(
     ),
     help="Run an experiment from the photographs to the report, look at its results, and publish them.",
 )
-_FAILURE_EXIT = 1
 _MANY = 1000
 
 
@@ -190,8 +189,7 @@ def say_wrong(ended: Sequence[Any]) -> None:
     wrong = [end for end in ended if end.how != "done"]
     for end in wrong:
         say_error(f"{end.name}: {end.text}")
-    if wrong:
-        raise typer.Exit(_FAILURE_EXIT)
+    fail_unless(not wrong)
 
 
 def predict(

@@ -6,9 +6,7 @@ from typing import Annotated
 
 import typer
 
-from nodes.runtime.terminal import print_table, say_error, table
-
-_FAILURE_EXIT = 1
+from nodes.runtime.terminal import fail_unless, print_table, say_error, table
 
 
 def list_command(
@@ -36,5 +34,4 @@ def list_command(
     problems = names_twice(found)
     for problem in problems:
         say_error(problem)
-    if problems:
-        raise typer.Exit(_FAILURE_EXIT)
+    fail_unless(not problems)

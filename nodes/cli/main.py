@@ -42,14 +42,14 @@ from nodes.cli.endings import (
 )
 from nodes.cli.panels import in_panels
 from nodes.runtime.extras import installs
-from nodes.runtime.terminal import LaunchFile, Overrides, print_table, say_error, table
+from nodes.runtime.terminal import FAILURE_EXIT, LaunchFile, Overrides, print_table, say_error, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
     from nodes.launching.launch import Launch
 
 OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
-ERROR_EXIT, FAILURE_EXIT = 2, 1
+ERROR_EXIT = 2
 
 PANELS = {
     "Audit and experiments": ("audit", "demo", "experiment", "verify"),

@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from nodes.runtime.terminal import Overrides, print_findings
+from nodes.runtime.terminal import Overrides, fail_unless, print_findings
 
 app = typer.Typer(no_args_is_help=True, help="Methods of attack: whether one keeps the contract.")
-_FAILURE_EXIT = 1
 
 
 @app.callback()
@@ -46,5 +45,4 @@ def method_check(
         findings = check_method(reference, document.data)
         print(f"{reference}:")
         met &= print_findings(findings)
-    if not met:
-        raise typer.Exit(_FAILURE_EXIT)
+    fail_unless(met)

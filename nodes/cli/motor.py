@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes.runtime.terminal import RunDir, print_table, table
+from nodes.runtime.terminal import FAILURE_EXIT, RunDir, fail_unless, print_table, table
 
 if TYPE_CHECKING:
     from nodes.runtime.bus import Bus, Received
@@ -107,11 +107,10 @@ def check_steering(
                     turned = yes or typer.confirm("did the front wheels turn left, then right?")
                     _ask_motor(bus, "confirm" if turned else "deny")
                 elif not shown.startswith("steering check:"):
-                    if not shown.startswith(("steering seen", "steering confirmed")):
-                        raise typer.Exit(1)
+                    fail_unless(shown.startswith(("steering seen", "steering confirmed")))
                     return
     print("no answer from the motor node; is it running?")
-    raise typer.Exit(1)
+    raise typer.Exit(FAILURE_EXIT)
 
 
 def _ask_motor(bus: Bus, action: str) -> None:

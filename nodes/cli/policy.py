@@ -13,7 +13,7 @@ from nodes.cli import policy_train as cli_policy_train
 from nodes.cli.policy_train import Goal
 from nodes.runtime.findings import CheckFinding
 from nodes.runtime.paths import shipped
-from nodes.runtime.terminal import PolicyName, print_findings, print_table, table
+from nodes.runtime.terminal import FAILURE_EXIT, PolicyName, fail_unless, print_findings, print_table, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ app = typer.Typer(
 )
 app.command("train")(cli_policy_train.train)
 app.command("eval")(cli_policy_train.evaluate)
-_FAILURE_EXIT = 1
 
 
 @app.command("check")
@@ -87,7 +86,7 @@ def policy_check(
     from nodes.lab.policy_reference import judged_by_drives
 
     if not is_factory(policy) and _lacks_declaration(Path(policy)):
-        raise typer.Exit(_FAILURE_EXIT)
+        raise typer.Exit(FAILURE_EXIT)
     adapted, sha256 = load_adapted(policy)
     reference = _reference(adapted.contract.view, run_folder, bag, room, scene, calibration, picture)
     print(f"{policy} ({sha256[:12]}) on {reference.source}")
@@ -95,8 +94,8 @@ def policy_check(
     methods = black_box_methods(adapted.stateless)
     findings = check_policy(adapted, reference.images, reference.steering_rad, told, methods)
     findings = judged_by_drives(adapted, reference, findings, told)
-    if not print_findings([CheckFinding(each.name, each.verdict, each.text) for each in findings], "check"):
-        raise typer.Exit(_FAILURE_EXIT)
+    rows = [CheckFinding(each.name, each.verdict, each.text) for each in findings]
+    fail_unless(print_findings(rows, "check"))
 
 
 def _lacks_declaration(file: Path) -> bool:

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nodes.runtime.terminal import Overrides, Topics, print_table, say_error, table
+from nodes.runtime.terminal import FAILURE_EXIT, Overrides, Topics, print_table, say_error, table
 
 if TYPE_CHECKING:
     from nodes.replaying.attack import RetroAttack
     from nodes.replaying.nodes import Choice
     from nodes.replaying.replay import Replay
 
-_DIFFERENT_EXIT = 1
 _DEG = 57.29577951308232
 _RETRO_NODES = "compositor,policy"
 
@@ -151,7 +150,7 @@ def _against(
         _say(run, time.perf_counter() - start)
         if difference is not None:
             say_error(f"differs from {golden}: {difference.text(run.info.start_ns)}")
-            raise typer.Exit(_DIFFERENT_EXIT)
+            raise typer.Exit(FAILURE_EXIT)
         print(f"equal to {golden}: {comparison.compared} messages compared")
 
 

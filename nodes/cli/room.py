@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes.runtime.terminal import RunDir, numbers_of, print_table, say_error, table
+from nodes.runtime.terminal import FAILURE_EXIT, RunDir, numbers_of, print_table, say_error, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,7 +24,6 @@ app = typer.Typer(
 BagFile = Annotated[Path, typer.Argument(help="Bag with the trace.", exists=True)]
 Topic = Annotated[str, typer.Option("--topic", help="Topic of the trace: /vicon/car or /vicon/wand.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")]
-FAILURE_EXIT = 1
 _ORIGIN = "0,0,0"
 
 

@@ -9,9 +9,7 @@ from typing import Annotated
 import typer
 
 from nodes.cli.cell_choice import File, Folder, Setting
-from nodes.runtime.terminal import Overrides, coloured, print_table, table
-
-_REFUSED_EXIT = 1
+from nodes.runtime.terminal import Overrides, coloured, fail_unless, print_table, table
 
 
 def gate(
@@ -69,5 +67,4 @@ def gate(
         print_table(rows)
         for reason in [reason for _, verdict in verdicts for reason in verdict.reasons]:
             print(reason)
-    if not all(verdict.passed for _, verdict in verdicts):
-        raise typer.Exit(_REFUSED_EXIT)
+    fail_unless(all(verdict.passed for _, verdict in verdicts))

@@ -13,9 +13,8 @@ import typer
 from advnerf_core.errors import ConfigError
 from advnerf_core.run_module import module_command
 from nodes.cli.cell_choice import CellChoice, load_cells
-from nodes.runtime.terminal import say_error
+from nodes.runtime.terminal import fail_unless, say_error
 
-_FAILURE_EXIT = 1
 # What ``advnerf audit`` leaves in its folder.
 AUDIT = "audit.json"
 
@@ -78,8 +77,7 @@ def verify(
     wrong += _say("page, pictures, films and reference build", verify_beside(published))
     wrong += _history(published)
     wrong += 0 if name else _ledger(published)
-    if wrong:
-        raise typer.Exit(_FAILURE_EXIT)
+    fail_unless(not wrong)
 
 
 def _audit(folder: Path) -> None:

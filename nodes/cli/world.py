@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from nodes.runtime.terminal import Overrides, print_findings, print_table, table
+from nodes.runtime.terminal import FAILURE_EXIT, Overrides, fail_unless, print_findings, print_table, table
 from nodes.runtime.termination import ends_in_order
 
 app = typer.Typer(
@@ -20,7 +20,6 @@ Name = Annotated[
         metavar="WORLD", help="A world of `advnerf scene world list`, or file.py:Class of your own."
     ),
 ]
-_FAILURE_EXIT = 1
 
 
 @app.command("check")
@@ -49,8 +48,7 @@ def world_check(
     say_code({"world": document.data}, Path.cwd())
     with ends_in_order():
         findings = check_world(read_world(document, Path.cwd()), pictures, only or [])
-    if not print_findings(findings):
-        raise typer.Exit(_FAILURE_EXIT)
+    fail_unless(print_findings(findings))
 
 
 @app.command("list")
@@ -98,6 +96,6 @@ def world_install(
         if environment.system:
             print(f"It needs these Debian packages, or what others call them: {' '.join(environment.system)}")
         if not yes and not typer.confirm(f"Install it into {environment.folder}?"):
-            raise typer.Exit(_FAILURE_EXIT)
+            raise typer.Exit(FAILURE_EXIT)
     made = install(environment, lambda text: print(text, flush=True), python)
     print(f"{'installed' if made else 'it is installed already'}: advnerf scene world check {name}")

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
     from nodes.runtime.findings import CheckFinding
 
+FAILURE_EXIT = 1
+"""Exit code of a command whose answer is no: something is not met, not granted or not equal."""
+
 _ADDRESS = re.compile(r"(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
 _LAST_PORT = 65535
 _POLICY_FILES = (".safetensors", ".onnx", ".pt2")
@@ -141,6 +144,12 @@ def print_table(full: Table) -> None:
     from rich.console import Console
 
     Console(width=None if sys.stdout.isatty() else 240, markup=False).print(full)
+
+
+def fail_unless(met: bool) -> None:
+    """Exit with `FAILURE_EXIT` if what a command examined is not as it should be."""
+    if not met:
+        raise typer.Exit(FAILURE_EXIT)
 
 
 def say_error(text: str) -> None:
