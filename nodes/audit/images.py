@@ -22,7 +22,6 @@ from nodes.runtime.progress import ProgressDisplay
 POSES, IMPORTED, REPORT, INPUT = "transforms.json", "photos", "import.json", "imported_from.json"
 _SPLATS = (".ply", ".spz", ".splat", ".glb")
 _EXTENT_M = 1.0  # of a set without a known metre, which is then rejected
-_MOVEMENT, _MOST = 0.06, 300  # as in ``advnerf scene from-video``
 
 
 @dataclass(frozen=True)
@@ -177,5 +176,4 @@ def _from_media(given: Path, output: Path, metric: MetricOptions, display: Progr
     from nodes.lab.importing.data_set import from_media
     from nodes.lab.importing.media import MediaConfig
 
-    config = MediaConfig(_MOVEMENT, _MOST, False)
-    from_media([given], output, config, SfmConfig(seed=0), _EXTENT_M, metric, display.start("poses"))
+    from_media([given], output, MediaConfig(), SfmConfig(seed=0), _EXTENT_M, metric, display.start("poses"))

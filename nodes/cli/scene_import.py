@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from nodes.lab.importing.data_set import Facts
 
 app = typer.Typer()
+_MOVEMENT = 0.06  # as MediaConfig has it, which takes OpenCV to import
 
 Output = Annotated[
     Path,
@@ -75,6 +77,17 @@ StepDeg = Annotated[
     ),
 ]
 
+
+@dataclass(frozen=True)
+class MediaOptions:
+    """What ``from-video`` and ``from-images`` share."""
+
+    most: Most = 300
+    one_camera: OneCamera = False
+    extent_m: ExtentM = 4.0
+    seed: Seed = 0
+
+
 # More images that were left out are not listed in the terminal.
 _SHOWN = 50
 
@@ -85,14 +98,11 @@ def from_video(
     media: Media,
     output: Output,
     metric: MetricOptions,
-    movement: Movement = 0.06,
-    most: Most = 300,
-    one_camera: OneCamera = False,
-    extent_m: ExtentM = 4.0,
-    seed: Seed = 0,
+    options: MediaOptions,
+    movement: Movement = _MOVEMENT,
 ) -> None:
     """Estimate poses and lenses of the sharpest frames of videos. Several videos and cameras go into one model."""
-    _from_media(media, output, movement, most, one_camera, extent_m, metric, seed)
+    _from_media(media, output, metric, options, movement)
 
 
 @app.command("from-images")
@@ -101,16 +111,13 @@ def from_images(
     media: Media,
     output: Output,
     metric: MetricOptions,
-    most: Most = 300,
-    one_camera: OneCamera = False,
-    extent_m: ExtentM = 4.0,
-    seed: Seed = 0,
+    options: MediaOptions,
 ) -> None:
     """Estimate poses and lenses of photographs, optionally with videos.
 
     The images of a folder share a camera unless their sizes or EXIF data differ.
     """
-    _from_media(media, output, 0.06, most, one_camera, extent_m, metric, seed)
+    _from_media(media, output, metric, options)
 
 
 @app.command("from-bag")
@@ -140,7 +147,7 @@ def from_phone_and_car(
     output: Output,
     bag: Annotated[Path, typer.Option(help="Bag of a drive through the same room.", exists=True)],
     calibration: Calibration = None,
-    movement: Movement = 0.06,
+    movement: Movement = _MOVEMENT,
     step_m: StepM = 0.15,
     step_deg: StepDeg = 8.0,
     most: Most = 200,
@@ -287,22 +294,19 @@ def match_colours(
 def _from_media(
     media: list[Path],
     output: Path,
-    movement: float,
-    most: int,
-    one_camera: bool,
-    extent_m: float,
     metric: MetricOptions,
-    seed: int,
+    options: MediaOptions,
+    movement: float = _MOVEMENT,
 ) -> None:
     from calibration.photo_model import SfmConfig
     from nodes.lab.importing.data_set import from_media as run
     from nodes.lab.importing.media import MediaConfig
 
-    config = MediaConfig(movement, most, one_camera)
+    config, sfm = MediaConfig(movement, options.most, options.one_camera), SfmConfig(seed=options.seed)
     _run(
         "from-media",
         output,
-        lambda report: run(media, output, config, SfmConfig(seed=seed), extent_m, metric, report),
+        lambda report: run(media, output, config, sfm, options.extent_m, metric, report),
     )
 
 
