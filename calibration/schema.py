@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from advnerf_core.documents import Document, dump_yaml, parse_yaml, read_yaml
+from advnerf_core.documents import Document, decode_text, dump_yaml, parse_yaml, read_yaml
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.errors import AdvnerfError, ConfigError, MissingFileError
 from advnerf_core.files import write_atomically
@@ -331,10 +331,10 @@ def measured(model: type[C], **values: Any) -> C:
         raise CalibrationError(str(error)) from None
 
 
-def parse_calibration(model: type[C], text: str, source: str) -> C:
-    """The same from text; ``source`` names it in messages."""
+def parse_calibration(model: type[C], content: bytes, source: str) -> C:
+    """The same from the content of a file, such as one in a bag; ``source`` names it in messages."""
     try:
-        return validate(model, parse_yaml(text, source))
+        return validate(model, parse_yaml(decode_text(content, source), source))
     except ConfigError as error:
         raise CalibrationError(str(error)) from None
 

@@ -11,6 +11,7 @@ from advnerf_core.attack.artifact import face_texture, save_attack
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole, planar_pose
 from benchmarks.host_pair import exchange_keys
+from calibration.schema import CalibrationError
 from nodes.bags.reader import read_messages
 from nodes.bags.writer import BagWriter
 from nodes.cli.main import app
@@ -288,6 +289,9 @@ def test_bags_without_a_drive_say_what_they_lack(tmp_path):
         evaluate_bag(tmp_path / "empty", None)
     with pytest.raises(BagError, match="got no /safety/state"):
         find_drives(tmp_path / "empty")
+    BagWriter(tmp_path / "damaged", {"room.yaml": b"kind: room\npath: [\n"}, {}).close()
+    with pytest.raises(CalibrationError, match=r"room.yaml in .*/damaged:\d: expected valid YAML"):
+        evaluate_bag(tmp_path / "damaged", None)
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ import numpy as np
 from advnerf_core.data.image_files import Rgb, write_image
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.data.video import thinned
-from advnerf_core.documents import decode_text
 from advnerf_core.geometry import Array
 from calibration.schema import CameraCalibration, load_calibration, parse_calibration
 from nodes.bags.decoded import read_poses
@@ -123,14 +122,12 @@ def _camera(bag: Path, file: Path | None) -> CameraCalibration:
     if file is not None:
         return load_calibration(CameraCalibration, file)
     try:
-        text = read_attachment(bag, _ATTACHED_CALIBRATION)
+        content = read_attachment(bag, _ATTACHED_CALIBRATION)
     except BagError as error:
         raise ImportRecordingError(
             f"expected the camera's calibration: {error}; give its file with --calibration"
         ) from error
-    return parse_calibration(
-        CameraCalibration, decode_text(text, source := f"{_ATTACHED_CALIBRATION} in {bag}"), source
-    )
+    return parse_calibration(CameraCalibration, content, f"{_ATTACHED_CALIBRATION} in {bag}")
 
 
 def _write_frames(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,7 +10,7 @@ import numpy as np
 
 from advnerf_core.driving.expert import Expert
 from advnerf_core.policies.view import PolicyView
-from calibration.schema import Calibration, CameraCalibration, load_calibration
+from calibration.schema import Calibration, CameraCalibration, load_calibration, parse_calibration
 from nodes.lab.policy_data.frames import RecordedFrames, frames_of, view_for_camera, view_for_size, view_of
 from nodes.lab.policy_data.logs import OpenLog
 
@@ -34,10 +33,7 @@ def attached_calibration(
         return load_calibration(model, given)
     for each in logs:
         if (content := each.log.attached().get(f"{name}.yaml")) is not None:
-            with tempfile.TemporaryDirectory() as folder:
-                file = Path(folder) / f"{name}.yaml of {each.log.path.name}"
-                file.write_bytes(content)
-                return load_calibration(model, file)
+            return parse_calibration(model, content, f"{name}.yaml of {each.log.path}")
     return None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,9 @@ import numpy as np
 
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path as DrivingPath
-from calibration.schema import RoomCalibration, load_calibration
+from calibration.schema import RoomCalibration, load_calibration, parse_calibration
 from nodes.bags.decoded import read_decoded
-from nodes.bags.reader import extract_attachments, read_info
+from nodes.bags.reader import read_attachments, read_info
 from nodes.bags.time_gaps import skipped_gaps
 from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
 from nodes.lab.trials.trial import MOVED_M
@@ -138,9 +137,7 @@ def measure_drives(bag: Path, room: RoomCalibration, ticks: int) -> list[dict[st
 def _room_of(bag: Path) -> RoomCalibration:
     if _ROOM not in read_info(bag).attachments:
         raise BagError(f"expected {_ROOM} attached to {bag}, found none; give the room file with --room")
-    with tempfile.TemporaryDirectory() as folder:
-        (file,) = extract_attachments(bag, Path(folder), [_ROOM])
-        return load_calibration(RoomCalibration, file)
+    return parse_calibration(RoomCalibration, read_attachments(bag)[_ROOM], f"{_ROOM} in {bag}")
 
 
 def _require(bag: Path, topics: tuple[str, ...]) -> None:
