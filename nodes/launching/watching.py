@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.documents import read_yaml
+from nodes.launching.launched import read_launched
 from nodes.launching.running import active_launches, is_running
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import LaunchError, MessageError
 from nodes.runtime.messages import stamp_ns
-from nodes.runtime.paths import RESOLVED_NAME, bus_folder
+from nodes.runtime.paths import bus_folder
 from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
 
@@ -76,15 +76,12 @@ def node_names(run_dir: Path) -> list[str]:
     return sorted(names | set(_launched(run_dir)))
 
 
-def _launched(run_dir: Path) -> list[str]:
+def _launched(run_dir: Path) -> tuple[str, ...]:
     """Names of the nodes of the launch that is running in a run folder."""
     try:
-        if not is_running(run_dir):
-            return []
-        resolved = read_yaml(run_dir / RESOLVED_NAME).data
-        return [name for name, entry in resolved["nodes"].items() if entry.get("if", True)]
+        return read_launched(run_dir).nodes if is_running(run_dir) else ()
     except FileNotFoundError:
-        return []
+        return ()
 
 
 def node_statuses(run_dir: Path) -> dict[str, Any]:
