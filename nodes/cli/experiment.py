@@ -221,9 +221,8 @@ def maps(
 
 
 app.command("run")(with_groups(experiment))
-for command in (status, report, predict, maps, publish):
+for command in (status, report, predict, maps, register, publish):
     app.command()(with_groups(command))
 app.command("table")(with_groups(table_command))
-app.command("register")(register)
 app.command("init")(init)
 app.command("list")(list_command)

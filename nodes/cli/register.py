@@ -4,17 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nodes.cli.cell_choice import CellChoice, File, Folder, Only, Setting, load_cells
-from nodes.runtime.terminal import Overrides
+from nodes.cli.cell_choice import CellChoice, load_cells
 
 
-def register(
-    file: File,
-    setting: Setting = None,
-    folder: Folder = None,
-    only: Only = None,
-    overrides: Overrides = None,
-) -> None:
+def register(choice: CellChoice) -> None:
     """Write down in docs/results what an experiment will run, and which tests will be claimed, before anything is run."""
     from advnerf_core.report.evidence.registration import FILE
     from nodes.experiment.engine.artefact import PUBLISHED as published
@@ -25,7 +18,7 @@ def register(
         raise ConfigError(
             f"expected the folder of published sets, {published}, in the working folder {Path.cwd()}, found none; change to your checkout, or make it"
         )
-    experiment, cells = load_cells(CellChoice(file, setting, folder, only, overrides))
+    experiment, cells = load_cells(choice)
     found = write_registration(experiment, cells, published)
     print(f"{published / found.name / FILE}: {found.digest[:12]}")
     print(
