@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.aruco import marker_dictionary
 from advnerf_core.geometry import Array
 from calibration.schema import CalibrationError
 
@@ -43,10 +44,6 @@ class Board:
                 f"expected a board of 3 x 3 squares or more with markers smaller than squares, got {self.columns} x {self.rows}, "
                 f"squares of {self.square_m} m, markers of {self.marker_m} m"
             )
-        if not hasattr(cv2.aruco, self.dictionary):
-            raise CalibrationError(
-                f"expected a marker dictionary such as DICT_4X4_50, got {self.dictionary!r}"
-            )
         if len(self._dictionary.bytesList) < self.columns * self.rows // 2:
             raise CalibrationError(
                 f"expected a dictionary of at least {self.columns * self.rows // 2} markers for this board, {self.dictionary} "
@@ -55,7 +52,7 @@ class Board:
 
     @property
     def _dictionary(self) -> Any:
-        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return marker_dictionary(self.dictionary)
 
     @property
     def opencv(self) -> Any:

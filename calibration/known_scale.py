@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.aruco import marker_dictionary
 from advnerf_core.data.similarity import Similarity, fit_positions
 from advnerf_core.geometry import Array, Pinhole, invert_transform
 from calibration.photo_model import Model, ReconstructionError
@@ -137,13 +138,10 @@ def marker_scale(views: Iterable[View], side_m: float, dictionary: str) -> Marke
         dictionary: OpenCV's name of the markers, such as ``DICT_APRILTAG_36h11``.
 
     Raises:
-        ReconstructionError: No such dictionary, no marker in two views, or markers of different sizes.
+        ConfigError: No such dictionary.
+        ReconstructionError: No marker in two views, or markers of different sizes.
     """
-    if not dictionary.startswith("DICT_") or not hasattr(cv2.aruco, dictionary):
-        raise ReconstructionError(
-            f"expected a marker dictionary such as DICT_4X4_50 or DICT_APRILTAG_36h11, got {dictionary!r}"
-        )
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)))
+    detector = cv2.aruco.ArucoDetector(marker_dictionary(dictionary))
     detector.setDetectorParameters(_subpixel())
     seen: defaultdict[int, list[tuple[Array, Pinhole, Array]]] = defaultdict(list)
     for image, pinhole, T in views:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from advnerf_core.aruco import marker_dictionary
 from advnerf_core.attack.printing.frame import CELLS, DICTIONARY
 from advnerf_core.geometry import Array
 from calibration.degeneracy import DegenerateDataError
@@ -52,11 +53,11 @@ def find_markers(
         DegenerateDataError: A marker is seen twice, or the edges of most are too blurred or too small.
     """
     grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
     # Small markers are found in an enlarged picture.
     times = 2 if grey.size < _LARGE_PX else 1
     enlarged = cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
-    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, _small()).detectMarkers(enlarged)
+    detector = cv2.aruco.ArucoDetector(marker_dictionary(DICTIONARY), _small())
+    corners, numbers, _ = detector.detectMarkers(enlarged)
     found = [] if numbers is None else [int(number) for number in numbers.ravel()]
     light = linear(grey).astype(np.float32)
     located, poor = {}, []

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from advnerf_core.errors import ConfigError
 from calibration import intrinsics
 from calibration.charuco import Board, BoardDetector
 from calibration.degeneracy import DegenerateDataError, PoorFitError
@@ -84,8 +85,9 @@ def test_impossible_boards_are_refused():
         Board(marker_m=0.2)
     with pytest.raises(CalibrationError, match="DICT_4X4_50 has 50"):
         Board(columns=20, rows=20)
-    with pytest.raises(CalibrationError, match="marker dictionary such as"):
-        Board(dictionary="DICT_NONE")
+    for dictionary in ("DICT_NONE", "ArucoDetector", "4X4_50"):
+        with pytest.raises(ConfigError, match="marker dictionary such as"):
+            Board(dictionary=dictionary)
 
 
 def test_the_file_survives_a_round_trip(views, tmp_path):

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.aruco import marker_dictionary
 from advnerf_core.geometry import Array
 
 DICTIONARY = "DICT_APRILTAG_36h11"
@@ -94,5 +95,4 @@ def frame_around(picture_m: tuple[float, float], number: int, marker_m: float | 
 
 def marker_cells(number: int) -> NDArray[np.uint8]:
     """Cells of a marker ``[8, 8]``, 0 or 255, its black edge included."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
-    return np.asarray(cv2.aruco.generateImageMarker(dictionary, number, CELLS), np.uint8)
+    return np.asarray(cv2.aruco.generateImageMarker(marker_dictionary(DICTIONARY), number, CELLS), np.uint8)
