@@ -16,6 +16,8 @@ import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from packaging.requirements import Requirement
+
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.kernel_cache import use_own_folder
 from advnerf_core.places import PlaceError, is_writable, user_place
@@ -35,9 +37,7 @@ CLOCK_ERROR_S = 0.005
 _UNSYNCHRONISED = 0x0040
 _CHRONYC_S = 2.0
 _OFFSET_WAIT_S = 0.8
-_REQUIREMENT = re.compile(
-    r"^([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*([^;]*)(?:;.*extra == ['\"]([a-z0-9-]+)['\"])?"
-)
+_EXTRA = re.compile(r"extra == ['\"]([a-z0-9-]+)['\"]")
 _NOT_OURS = ("all", "dev")
 
 
@@ -52,15 +52,18 @@ def versions() -> list[CheckResult]:
 
 
 def packages(requirements: Iterable[str]) -> list[CheckResult]:
-    """Check a package's requirements: missing, too old or too new packages, and complete extras."""
+    """Check a package's requirements: missing, too old or too new packages, and complete extras.
+
+    What a marker asks for on other computers only is not looked for.
+    """
     wrong: dict[str, list[str]] = {}
-    for requirement in requirements:
-        match = _REQUIREMENT.match(requirement)
-        if match is None or (extra := match[3] or "") in _NOT_OURS:
+    for each in map(Requirement, requirements):
+        extra = _extra(each)
+        if extra in _NOT_OURS:
             continue
-        wrong.setdefault(extra, [])
-        if trouble := _trouble(match[1], match[2].strip()):
-            wrong[extra].append(trouble)
+        found = wrong.setdefault(extra, [])
+        if each.marker is None or each.marker.evaluate({"extra": extra}):
+            found += _trouble(each)
     extras = [name for name in wrong if name and not wrong[name]]
     rows = report("extras", OK, f"complete: {', '.join(extras) or 'none'}")
     if base := wrong.get("", []):
@@ -72,30 +75,19 @@ def packages(requirements: Iterable[str]) -> list[CheckResult]:
     return rows
 
 
-def _trouble(name: str, specifier: str) -> str:
+def _extra(requirement: Requirement) -> str:
+    """The extra that a requirement is of; empty for one of the base."""
+    match = _EXTRA.search(str(requirement.marker or ""))
+    return match[1] if match else ""
+
+
+def _trouble(requirement: Requirement) -> list[str]:
+    name, wanted = requirement.name, requirement.specifier
     try:
         found = importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
-        return f"{name} is missing"
-    return "" if satisfies(found, specifier) else f"{name} {found} is not {specifier}"
-
-
-def satisfies(version: str, specifier: str) -> bool:
-    """Whether a version satisfies a specifier of ``>=``, ``<`` and ``==``, joined by commas."""
-    have = _release(version)
-    for part in filter(None, specifier.replace(" ", "").split(",")):
-        operator, wanted = re.match(r"(>=|<|==)?(.*)", part).groups()  # type: ignore[union-attr]
-        want = _release(wanted)
-        width = max(len(have), len(want))
-        left, right = (release + (0,) * (width - len(release)) for release in (have, want))
-        if not {">=": left >= right, "<": left < right, "==": left == right}.get(operator or "==", True):
-            return False
-    return True
-
-
-def _release(text: str) -> tuple[int, ...]:
-    match = re.match(r"\d+(?:\.\d+)*", text)
-    return tuple(map(int, match[0].split("."))) if match else ()
+        return [f"{name} is missing"]
+    return [] if wanted.contains(found, prereleases=True) else [f"{name} {found} is not {wanted}"]
 
 
 def machine() -> list[CheckResult]:

@@ -127,8 +127,18 @@ def test_requirements_are_compared_with_what_is_installed():
         ("1.0", "", True),
     ],
 )
-def test_specifiers(version, specifier, fits):
-    assert machine.satisfies(version, specifier) is fits
+def test_specifiers(monkeypatch, version, specifier, fits):
+    monkeypatch.setattr(machine.importlib.metadata, "version", lambda name: version)
+    assert (machine.packages([f"thing{specifier}"])[0].state == OK) is fits
+
+
+def test_what_only_another_computer_needs_does_not_make_an_extra_incomplete():
+    elsewhere = "nobody-has-this>=11,<12; platform_machine == 'vax' and extra == 'ros2'"
+    here = "numpy; platform_machine != 'vax' and extra == 'ros2'"
+    (row,) = machine.packages([elsewhere, here, "nobody-has-this; python_version < '3'"])
+    assert row == CheckResult("extras", OK, "complete: ros2")
+    rows = machine.packages([elsewhere.replace("==", "!=", 1)])
+    assert [row.found for row in rows] == ["complete: none"]
 
 
 def test_permission_is_cured_by_the_group_or_by_logging_in_again(monkeypatch):
