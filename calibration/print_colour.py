@@ -14,6 +14,7 @@ from advnerf_core.attack.printing.poster import MM_PER_M, Printable
 from advnerf_core.geometry import Array, transform_points
 from advnerf_core.plain import PlainData
 from advnerf_core.scene.colour import fit_colour_map
+from advnerf_core.srgb import to_display
 from calibration.degeneracy import DegenerateDataError
 from calibration.print_markers import linear
 from calibration.schema import Intrinsics
@@ -130,8 +131,7 @@ def evenly_lit(seen: Array, light: Light, points_m: Array) -> Array:
 
 def encoded(light: Array) -> Array:
     """sRGB colours in 0..255 of linear light in 0..1."""
-    bent = 1.055 * np.maximum(light, 1e-9) ** (1.0 / 2.4) - 0.055
-    return 255.0 * np.where(light <= 0.0031308, 12.92 * light, bent)
+    return np.asarray(255.0 * to_display(light), np.float64)
 
 
 def patch_colours(

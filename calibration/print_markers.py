@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from advnerf_core.aruco import marker_dictionary
 from advnerf_core.attack.printing.frame import CELLS, DICTIONARY
 from advnerf_core.geometry import Array
+from advnerf_core.srgb import to_linear
 from calibration.degeneracy import DegenerateDataError
 from calibration.schema import Intrinsics
 
@@ -35,8 +36,7 @@ _DIRECTIONS, _MOST_PIXELS = 36, 500_000
 
 def linear(rgb: ArrayLike) -> Array:
     """Linear light in 0..1 of sRGB colours in 0..255."""
-    share = np.asarray(rgb, np.float64) / 255.0
-    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return to_linear(np.asarray(rgb, np.float64) / 255.0)
 
 
 def find_markers(

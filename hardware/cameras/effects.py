@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.srgb import to_display, to_linear
 from advnerf_core.strict import StrictModel
 
 Rgb = NDArray[np.uint8]
@@ -222,16 +223,7 @@ def _decoded(picture: Rgb) -> _Linear:
 
 
 def _encoded(light: _Linear) -> Rgb:
-    clipped = np.clip(light, 0.0, 1.0)
-    curve = np.where(
-        clipped <= 0.0031308, 12.92 * clipped, 1.055 * np.power(clipped, np.float32(1.0 / 2.4)) - 0.055
-    )
-    return np.rint(255.0 * curve).astype(np.uint8)
+    return np.rint(255.0 * to_display(np.clip(light, 0.0, 1.0))).astype(np.uint8)
 
 
-def _srgb_curve() -> _Linear:
-    value = np.arange(256) / 255.0
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-_LINEAR = _srgb_curve()
+_LINEAR: _Linear = to_linear(np.arange(256) / 255.0).astype(np.float32)

@@ -20,6 +20,7 @@ from advnerf_core.errors import ConfigError
 from advnerf_core.geometry import Array
 from advnerf_core.inputs import InputFileError, InputFiles
 from advnerf_core.objects.voxel.mesh import MeshError, MeshPart, SurfaceMesh, part_from_colours, stand
+from advnerf_core.srgb import to_display, to_linear
 
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 _GLTF = (".glb", ".gltf")
@@ -278,19 +279,10 @@ def _texture(material: Any, path: Path, linear: bool, notes: list[str]) -> NDArr
     rgb = np.ascontiguousarray(rgba[..., :3])
     if factor is None or (np.asarray(factor)[:3] == 255).all():
         return rgb
-    product = _linear(rgb) * np.asarray(factor, np.float64)[:3] / 255.0 if linear else rgb
+    product = to_linear(rgb) * np.asarray(factor, np.float64)[:3] / 255.0 if linear else rgb
     return np.ascontiguousarray(_displayed(product, linear), dtype=np.float32)
 
 
 def _displayed(rgb: Array, linear: bool) -> Array:
-    """Display values of colours 0..1, by the sRGB curve (IEC 61966-2-1) where they are linear light."""
-    if not linear:
-        return np.asarray(rgb, np.float64)
-    low = np.asarray(rgb, np.float64) <= 0.0031308
-    return np.where(low, 12.92 * rgb, 1.055 * np.power(np.maximum(rgb, 0.0031308), 1 / 2.4) - 0.055)
-
-
-def _linear(rgb: NDArray[np.float32]) -> Array:
-    """Linear light of display values 0..1."""
-    values = np.asarray(rgb, np.float64)
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    """Display values of colours 0..1, by the sRGB curve where they are linear light."""
+    return np.asarray(to_display(rgb) if linear else rgb, np.float64)
