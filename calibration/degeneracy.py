@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from advnerf_core.geometry import Array
+from advnerf_core.geometry import Array, make_transform
 from calibration.schema import CalibrationError
 
 
@@ -22,6 +22,11 @@ def mean_rotation(rotations: ArrayLike) -> Array:
     """Chordal mean ``[3, 3]`` of rotations ``[N, 3, 3]``: the rotation nearest to their arithmetic mean."""
     u, _, vt = np.linalg.svd(np.asarray(rotations, np.float64).mean(axis=0))
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+
+def mean_transform(T: Array) -> Array:
+    """Mean ``[4, 4]`` of the rotations and of the positions of poses ``[N, 4, 4]``."""
+    return make_transform(mean_rotation(T[:, :3, :3]), T[:, :3, 3].mean(axis=0))
 
 
 def rotation_spread(rotations: ArrayLike) -> Array:

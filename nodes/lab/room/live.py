@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.geometry import Array, make_transform
-from calibration.degeneracy import mean_rotation
+from advnerf_core.geometry import Array
+from calibration.degeneracy import mean_transform
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import pose_matrix
 
@@ -34,9 +34,4 @@ def standing_poses(run_dir: Path, topic: str, period_s: float) -> Iterator[Array
                 continue
             due = now + period_s
             fresh = len(recent) >= _LEAST_POSES and now - recent[-1][0] < _LOST_S
-            yield _mean([T for _, T in recent]) if fresh else None
-
-
-def _mean(poses: list[Array]) -> Array:
-    stack = np.stack(poses)
-    return make_transform(mean_rotation(stack[:, :3, :3]), stack[:, :3, 3].mean(axis=0))
+            yield mean_transform(np.stack([T for _, T in recent])) if fresh else None

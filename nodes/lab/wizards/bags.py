@@ -15,10 +15,10 @@ from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.errors import ConfigError, MissingFileError
-from advnerf_core.geometry import Array, interpolate_transform, make_transform
+from advnerf_core.geometry import Array, interpolate_transform
 from calibration.camera_to_car import MountView
 from calibration.charuco import BoardDetector, Detection
-from calibration.degeneracy import DegenerateDataError, mean_rotation
+from calibration.degeneracy import DegenerateDataError, mean_transform
 from calibration.display_colour import mean_colour, screen_region
 from calibration.schema import CalibrationError
 from calibration.vehicle import RecordedDrive
@@ -228,7 +228,7 @@ def _still_pose(series: PoseSeries, stamp: int) -> Array | None:
     poses = series.around(stamp, round(_HALF_WINDOW_S * 1e9))
     if poses is None:
         return None
-    mean = make_transform(mean_rotation(poses[:, :3, :3]), poses[:, :3, 3].mean(axis=0))
+    mean = mean_transform(poses)
     moved = float(np.linalg.norm(poses[:, :3, 3] - mean[:3, 3], axis=1).max())
     turned = float(rotation_angles(mean[:3, :3].T @ poses[:, :3, :3]).max())
     return mean if moved <= _MOST_MOTION_M and turned <= _MOST_TURN_RAD else None
