@@ -15,11 +15,11 @@ import numpy as np
 from nodes.bags.decoded import read_decoded
 from nodes.bags.reader import read_info
 from nodes.control.stop_causes import is_result
+from nodes.lab.trials.evaluation import SENT, command_ages_ns
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import ns_from_stamp
 from nodes.runtime.topics import STATUS_PREFIX
 
-_SENT = "/motor/sent"
 # Share of control ticks that may have no new command, or a late one.
 _TICK_SHARE = 0.1
 # Time from the capture of an image to its command beyond which the command is late [s]. It is two control periods.
@@ -88,7 +88,7 @@ def read_health(
     last_ns = end_real_ns - round(tick_s * NS_PER_S)
     ticks = max(0, int((last_ns - start_real_ns) / NS_PER_S / tick_s + 1e-6))
     recorded = {topic.name for topic in read_info(bag).topics}
-    ages_s = _command_ages_s(bag, start_real_ns, last_ns) if _SENT in recorded else np.zeros(0)
+    ages_s = _command_ages_s(bag, start_real_ns, last_ns) if SENT in recorded else np.zeros(0)
     reports = {
         name.removeprefix(STATUS_PREFIX): _counters(bag, name, start_real_ns)
         for name in sorted(recorded)
@@ -110,12 +110,7 @@ def read_health(
 
 def _command_ages_s(bag: Path, start_ns: int, end_ns: int) -> Any:
     """Time from capture to the first serial write of every image of the drive that became a command ``[n]`` [s]."""
-    written: dict[int, float] = {}
-    for message in read_decoded(bag, _SENT):
-        stamp_ns = ns_from_stamp(message.header.stamp)
-        if start_ns <= stamp_ns < end_ns and not message.braking:
-            written.setdefault(stamp_ns, (int(message.serial_write_real_ns) - stamp_ns) / NS_PER_S)
-    return np.array(list(written.values()))
+    return np.array([age / NS_PER_S for at, age in command_ages_ns(bag).items() if start_ns <= at < end_ns])
 
 
 def _counters(bag: Path, topic: str, start_ns: int) -> list[tuple[int, dict[str, float]]]:

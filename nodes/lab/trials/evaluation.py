@@ -27,6 +27,7 @@ HOPS = {
     "policy": "/policy/drive",
     "safety": "/safety/drive",
 }
+SENT = "/motor/sent"
 # Topics on which nodes report that they show an attack, with its id.
 SHOWN_BY = ("/compositor/attack", "/monitor/attack")
 _SEEN = "/compositor/image"
@@ -104,11 +105,7 @@ def timing(bag: Path, start_real_ns: int, end_real_ns: int) -> Timing:
     """Compute the latency of every frame captured between two times [ns, CLOCK_REALTIME]."""
     captured = [stamp for stamp, _ in _stamps(bag, HOPS["camera"]) if start_real_ns <= stamp < end_real_ns]
     inside = set(captured)
-    written: dict[int, float] = {}
-    for message in read_decoded(bag, "/motor/sent"):
-        stamp_ns = ns_from_stamp(message.header.stamp)
-        if stamp_ns in inside and not message.braking:
-            written.setdefault(stamp_ns, (int(message.serial_write_real_ns) - stamp_ns) / _NS_PER_MS)
+    written = {at: age / _NS_PER_MS for at, age in command_ages_ns(bag).items() if at in inside}
     hops = {
         name: np.array(
             [(published - stamp) / _NS_PER_MS for stamp, published in _stamps(bag, topic) if stamp in inside]
@@ -116,6 +113,16 @@ def timing(bag: Path, start_real_ns: int, end_real_ns: int) -> Timing:
         for name, topic in HOPS.items()
     }
     return Timing(np.array(list(written.values())), hops, len(captured), len(inside - written.keys()))
+
+
+def command_ages_ns(bag: Path) -> dict[int, int]:
+    """Time from the capture of every image that became a command to its first serial write, by its capture stamp [ns]."""
+    ages: dict[int, int] = {}
+    for message in read_decoded(bag, SENT):
+        stamp_ns = ns_from_stamp(message.header.stamp)
+        if not message.braking:
+            ages.setdefault(stamp_ns, int(message.serial_write_real_ns) - stamp_ns)
+    return ages
 
 
 def frames(bag: Path, start_real_ns: int, count: int, period_s: float = 0.1) -> NDArray[np.uint8]:
