@@ -9,7 +9,7 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.page import searched_apart
 from benchmarks.paper_table import PUBLISHED, ledger_rows
 
-CAR, JUNCTION = PUBLISHED / "paper_car", PUBLISHED / "paper_junction"
+CAR, JUNCTION, SIDES = (PUBLISHED / f"paper_{name}" for name in ("car", "junction", "junction_sides"))
 
 
 @pytest.mark.parametrize(("scenario", "met"), [("green_screen", True), ("monitor", False)])
@@ -33,27 +33,39 @@ def test_the_tests_are_those_of_complete_sets(tmp_path):
     row = ledger_rows(PUBLISHED)[0]
     tests = [
         each
-        for name in (CAR, JUNCTION)
+        for name in (CAR, JUNCTION, SIDES)
         for each in json.loads((name / "set" / "set.json").read_text())["primary"]
     ]
     assert (row.value, row.unit, row.met) == (len(tests), f"of {len(tests)}", True)
     assert ledger_rows(tmp_path) == []
 
 
-@pytest.mark.parametrize(("scenario", "met"), [("straight", False), ("right", True), ("left", False)])
-def test_the_excess_at_the_junction_is_over_the_stronger_control_of_its_cells(scenario, met):
+@pytest.mark.parametrize(
+    ("published", "scenario", "met"),
+    [
+        (JUNCTION, "straight", False),
+        (JUNCTION, "right", True),
+        (JUNCTION, "left", False),
+        (SIDES, "straight", True),
+        (SIDES, "left", True),
+    ],
+)
+def test_the_excess_at_the_junction_is_over_the_stronger_control_of_its_cells(published, scenario, met):
     def mean_m(method):
         """Mean |CTE| per tick of each start, over the searches [m]."""
         found = [
             np.divide(each.deployed.total_cte_m, each.ticks)
-            for each in read_cells(JUNCTION)
+            for each in read_cells(published)
             if (each.scenario, each.victim, each.method) == (scenario, "hardened", method)
         ]
         return np.mean(found, axis=0)
 
     controls = {"plain": mean_m("none"), "no": mean_m("empty")}
     stronger = max(controls, key=lambda each: controls[each].mean())
-    row = next(each for each in ledger_rows(PUBLISHED) if f"junction, {scenario}" in each.line)
+    changed = ", one side of the path maximised" if published is SIDES else ""
+    row = next(
+        each for each in ledger_rows(PUBLISHED) if f"junction, {scenario}{changed}, victim" in each.line
+    )
     expected_m = (mean_m("gradient") - controls[stronger]).mean()
     assert row.note.startswith(f"{expected_m:.3f} m in the mean over {stronger} objects, 6 searches")
     assert row.value < expected_m
