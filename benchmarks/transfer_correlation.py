@@ -140,14 +140,14 @@ def ledger_rows() -> list[LedgerRow]:
 def picture() -> Figure:
     """All points, by set."""
     sets = _complete()
-    with new_axes(6.0, 5.0) as ax:
+    with new_axes(7.5, 5.0) as ax:
         ends = np.array([min(each.xy.min() for each in sets), max(each.xy.max() for each in sets)])
         ax.plot(ends, ends, color=LIGHT["muted"], lw=1.0, zorder=1, label="as in the learned scene")
         for number, each in enumerate(sets):
             colour, marker = _COLOURS[number % len(_COLOURS)], _MARKERS[number % len(_MARKERS)]
             ax.plot(*each.xy.T, marker, ms=5, mfc="none", color=colour, label=each.name.replace("_", " "))
         ax.set(xlabel="in the learned scene [half lanes per tick]", ylabel="deployed [half lanes per tick]")
-        ax.legend(loc="lower right", fontsize=8)
+        ax.figure.legend(loc="outside right upper", fontsize=8)
     figure: Figure = ax.figure
     return figure
 

@@ -8,6 +8,7 @@ maximum, or stops with the car, defines a relaxation.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -147,7 +148,7 @@ class CrossTrackError(Objective):
         return -drives.cte_m.abs().sum(0)
 
 
-class ToOneSide(Objective):
+class ToOneSide(Objective, ABC):
     """How far the car drives to one side of its path: the common part of `DriftLeft`, `DriftRight` and `RunWide`.
 
     ``sum_t |c_t|`` has a maximum on either side of the path, and a gradient climbs the one on whose side the car happens to be. The value
@@ -155,9 +156,9 @@ class ToOneSide(Objective):
     one side.
     """
 
+    @abstractmethod
     def side(self, drives: JudgedDrives) -> Tensor | float:
         """The sign s of all drives, or of each, ``[B]``: 1 is left."""
-        raise NotImplementedError(f"{type(self).__name__} has no side(); implement it")
 
     def value(self, drives: JudgedDrives) -> Tensor:
         """Sum of the error to the side by the protocol, ``[B]`` [m]; negative on the other side."""
