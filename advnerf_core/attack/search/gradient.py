@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Totals, adjoint_gradient
-from advnerf_core.attack.methods import FRESH_RUN, SearchRun, SearchSettings
+from advnerf_core.attack.methods import FRESH_RUN, GRADIENT_RATE, SearchRun, SearchSettings
 from advnerf_core.attack.search.descent import Descent
 from advnerf_core.attack.search.population import Coarse
 from advnerf_core.attack.search.record import Evaluation, SearchResult
@@ -58,7 +58,7 @@ def search_coarse(problem: AttackProblem, settings: SearchSettings, run: SearchR
 def gradient_attack(
     problem: AttackProblem,
     iterations: int = 50,
-    learning_rate: float = 0.1,
+    learning_rate: float = GRADIENT_RATE,
     run: SearchRun = FRESH_RUN,
 ) -> SearchResult:
     """Maximise the objective by gradient descent on its loss.

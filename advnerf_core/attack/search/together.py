@@ -19,6 +19,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Sensor, Totals, adjoint_gradient
+from advnerf_core.attack.methods import GRADIENT_RATE
 from advnerf_core.attack.problem import SearchDivergedError
 from advnerf_core.attack.search.descent import Descent
 from advnerf_core.attack.search.record import Evaluation, SearchResult
@@ -87,7 +88,7 @@ def gradient_attacks(
     problems: Sequence[AttackProblem],
     seeds: Sequence[int],
     iterations: int = 50,
-    learning_rate: float = 0.1,
+    learning_rate: float = GRADIENT_RATE,
     state_path: Path | None = None,
     on_evaluation: OnSeedEvaluation | None = None,
     settings_hash: str = "",

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from advnerf_core.attack.methods import GRADIENT_RATE
 from advnerf_core.attack.objectives import CTE
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
 from advnerf_core.strict import Angle, AngularRate, RightAngleRad, StrictModel, at_most
@@ -323,7 +324,7 @@ class AttackConfig(StrictModel):
     response: ResponseConfig = Field(
         default=ResponseConfig(), description="How late and slowly the searched car's wheels obey."
     )
-    learning_rate: PositiveNumber = Field(default=0.1, description="Adam's step along a gradient.")
+    learning_rate: PositiveNumber = Field(default=GRADIENT_RATE, description="Adam's step along a gradient.")
     random_sigma: PositiveNumber = Field(default=5.0, description="Spread of the random textures' theta.")
     step: PositiveNumber | None = Field(
         default=None,

@@ -23,7 +23,7 @@ from nodes.experiment.steps import bake
 from nodes.runtime.errors import RuntimeFault
 
 # Like a stage's version (`pipeline.VERSIONS`): raised when the result of a cell changes with the same settings.
-VERSION = 4  # 4: textures are rounded to half precision before they are driven past
+VERSION = 5  # 5: gradients are followed in steps of 0.3 instead of 0.1
 # Settings that a cell does not depend on: other cells, memory limits, and values that are separate inputs below.
 FREE: Mapping[str, Any] = {
     "name": True,

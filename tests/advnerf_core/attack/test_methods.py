@@ -11,6 +11,7 @@ import torch
 
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.methods import (
+    GRADIENT_RATE,
     METHODS,
     Method,
     MethodError,
@@ -70,7 +71,7 @@ def by_hand(problem):
         def slope(drawn, theta):
             return Slope(0.0, evaluate(drawn, theta)[1], -side * looked.deviation(theta)[1])
 
-        return climb(problem, slope, 4, 0.1, run, method="frame")
+        return climb(problem, slope, 4, GRADIENT_RATE, run, method="frame")
 
     return {
         "random": lambda: random_search(problem, 4, 5.0, run=SearchRun(3)),
@@ -80,8 +81,8 @@ def by_hand(problem):
         "random_natural": lambda: family("random_natural", textures.natural),
         "cem": lambda: population_search(problem, CrossEntropy(3.0), 4, 4, 2, run=SearchRun(3)),
         "evolution": lambda: population_search(problem, Evolution(1.0, 0.5), 4, 4, 2, run=SearchRun(3)),
-        "gradient": lambda: gradient_attack(problem, 4, 0.1, run=SearchRun(3)),
-        "gradient_coarse": lambda: climb(problem, adjoint_slope, 4, 0.1, run, 2, method="gradient_coarse"),
+        "gradient": lambda: gradient_attack(problem, 4, GRADIENT_RATE, run=SearchRun(3)),
+        "gradient_coarse": lambda: climb(problem, adjoint_slope, 4, GRADIENT_RATE, run, 2, method="gradient_coarse"),
         "frame": frames,
         # 4 evaluations of 2 starts and 2 ticks: 16 calls. 4 for the first lesson, 12 for a drive with one pair of questions.
         "guided": lambda: black_box_attack(
@@ -146,7 +147,7 @@ def test_a_sensor_with_a_scale_of_its_own_says_it(problem):
     assert random_spread(shaped, SearchSettings()) == sensor.random_sigma
     asked = SearchSettings(learning_rate=0.3, sigma=0.7)
     assert (gradient_step(shaped, asked), random_spread(shaped, asked)) == (0.3, 0.7)
-    assert (gradient_step(problem, SearchSettings()), random_spread(problem, SearchSettings())) == (0.1, 5.0)
+    assert (gradient_step(problem, SearchSettings()), random_spread(problem, SearchSettings())) == (0.3, 5.0)
 
 
 def test_names_and_needs_are_known_without_torch():

@@ -33,7 +33,7 @@ def test_the_first_iterations_are_adam_written_out(problem):
         g = result.gradient.double()
         m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g**2
         theta = theta - 0.1 * (m / (1 - 0.9**step)) / ((v / (1 - 0.999**step)).sqrt() + 1e-8)
-    result = gradient_attack(problem, iterations=3, run=SearchRun(5))
+    result = gradient_attack(problem, 3, 0.1, SearchRun(5))
     np.testing.assert_allclose([e.loss_m for e in result.history], losses, rtol=1e-5)
 
 
