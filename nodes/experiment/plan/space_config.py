@@ -73,7 +73,8 @@ class _MeshConfig(StrictModel):
     )
     ball_rgb: tuple[Unit, Unit, Unit] = Field(default=(0.75, 0.1, 0.08), description="Colour of the balls.")
     learning_rate: PositiveNumber | None = Field(
-        default=None, description="Of Adam; none: attack.learning_rate for textures, a twentieth of the bound for shapes."
+        default=None,
+        description="Of Adam; none: attack.learning_rate for textures, a twentieth of the bound for shapes.",
     )
 
 

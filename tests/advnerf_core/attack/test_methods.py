@@ -82,7 +82,9 @@ def by_hand(problem):
         "cem": lambda: population_search(problem, CrossEntropy(3.0), 4, 4, 2, run=SearchRun(3)),
         "evolution": lambda: population_search(problem, Evolution(1.0, 0.5), 4, 4, 2, run=SearchRun(3)),
         "gradient": lambda: gradient_attack(problem, 4, GRADIENT_RATE, run=SearchRun(3)),
-        "gradient_coarse": lambda: climb(problem, adjoint_slope, 4, GRADIENT_RATE, run, 2, method="gradient_coarse"),
+        "gradient_coarse": lambda: climb(
+            problem, adjoint_slope, 4, GRADIENT_RATE, run, 2, method="gradient_coarse"
+        ),
         "frame": frames,
         # 4 evaluations of 2 starts and 2 ticks: 16 calls. 4 for the first lesson, 12 for a drive with one pair of questions.
         "guided": lambda: black_box_attack(
