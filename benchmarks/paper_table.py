@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.documents import read_json
+from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.families import COARSE_SEARCHES, RANDOM_FAMILIES
 from advnerf_core.report.evidence.verifying.layout import SET, complete_sets
@@ -19,7 +20,11 @@ from benchmarks.results import REPOSITORY, LedgerRow
 COMMAND = "python -m benchmarks.paper_table"
 PUBLISHED = REPOSITORY / "docs" / "results"
 # The sets of each experiment, with what later ones changed.
-_CARS = {"paper_car": "", "paper_monitor": ", behind the way of a car that leaves the track"}
+_CARS = {
+    "paper_car": "",
+    "paper_monitor": ", behind the way of a car that leaves the track",
+    "paper_monitor_passed": ", beside the way of a car that leaves the track",
+}
 _JUNCTIONS = {"paper_junction": "", "paper_junction_sides": ", one side of the path maximised"}
 _IDEALISED = ("nothing_idealised", "imperfect_camera")
 _METHOD, _VICTIM = "gradient", "hardened"
@@ -54,7 +59,7 @@ def _rows(published: Path) -> Iterator[LedgerRow]:
         yield _tests(tests)
     for name, changed in _CARS.items():
         if name in sets:
-            yield from _off_track(sets[name]["rows"], changed)
+            yield from _off_track(sets[name]["rows"], changed, read_cells(published / name))
     for name, changed in _JUNCTIONS.items():
         if name in sets:
             yield from _excess(sets[name]["rows"], changed)
@@ -74,13 +79,24 @@ def _tests(tests: list[dict[str, Any]]) -> LedgerRow:
     return LedgerRow(line, len(shown), f"of {len(tests)}", "all", len(shown) == len(tests), COMMAND, note)
 
 
-def _off_track(rows: list[dict[str, Any]], changed: str) -> Iterator[LedgerRow]:
+def _off_track(rows: list[dict[str, Any]], changed: str, cells: list[CellResult]) -> Iterator[LedgerRow]:
     for scenario, target in _OFF_TRACK.items():
         if any(each["scenario"] == scenario for each in rows):
-            yield _off_track_past(rows, scenario, target, changed)
+            of = [each for each in cells if (each.scenario, each.victim) == (scenario, _VICTIM)]
+            freely = sum(_left_freely(each) for each in of if each.method == _METHOD)
+            yield _off_track_past(rows, scenario, target, changed, freely)
 
 
-def _off_track_past(rows: list[dict[str, Any]], scenario: str, target: float, changed: str) -> LedgerRow:
+def _left_freely(cell: CellResult) -> int:
+    """Number of a cell's deployed drives that left the track and ran into nothing."""
+    assert cell.deployed is not None, "the set is complete"
+    ends = zip(cell.deployed.off_track, cell.obstacles("deployed"), strict=True)
+    return sum(off and obstacle is None for off, obstacle in ends)
+
+
+def _off_track_past(
+    rows: list[dict[str, Any]], scenario: str, target: float, changed: str, freely: int
+) -> LedgerRow:
     ours = _row(rows, scenario, _METHOD)
     without = [
         each
@@ -90,7 +106,8 @@ def _off_track_past(rows: list[dict[str, Any]], scenario: str, target: float, ch
     ]
     off, drives = (sum(each[key] for each in without) for key in ("off_track", "drives"))
     note = (
-        f"{ours['off_track']} of {ours['drives']} drives of {ours['searches']} searches; ran into something: {collisions(ours['collided'])}; "
+        f"{ours['off_track']} of {ours['drives']} drives of {ours['searches']} searches, {freely} of them without running into something afterwards; ran into "
+        f"something: {collisions(ours['collided'])}; "
         f"excess {ours['excess_m']:.3f} m per tick; methods without a gradient: {off} of {drives} drives off the track, "
         f"{sum(sum(each['collided'].values()) for each in without)} ran into something"
     )
