@@ -20,11 +20,7 @@ from benchmarks.results import REPOSITORY, LedgerRow
 COMMAND = "python -m benchmarks.paper_table"
 PUBLISHED = REPOSITORY / "docs" / "results"
 # The sets of each experiment, with what later ones changed.
-_CARS = {
-    "paper_car": "",
-    "paper_monitor": ", behind the way of a car that leaves the track",
-    "paper_monitor_passed": ", beside the way of a car that leaves the track",
-}
+_CARS = {"paper_car": "", "paper_monitor": ", behind the way of a car that leaves the track"}
 _JUNCTIONS = {"paper_junction": "", "paper_junction_sides": ", one side of the path maximised"}
 _IDEALISED = ("nothing_idealised", "imperfect_camera")
 _METHOD, _VICTIM = "gradient", "hardened"
