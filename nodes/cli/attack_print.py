@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from nodes.runtime.options import with_groups
-from nodes.runtime.terminal import numbers_of, print_table, table
+from nodes.runtime.terminal import pose_of, print_table, table
 
 if TYPE_CHECKING:
     from advnerf_core.attack.artifact import AttackFile
@@ -150,7 +150,12 @@ def attack_measure(
     attack_file = attack_file or printed.parent / record.attack_file
     refuse_overwriting((source, printed, camera, card, attack_file, request), measured_files(target))
     attack = load_attack(attack_file)
-    known = KnownLength(None if card is None else load_record(card), distance_m, width_m, _pose(car))
+    known = KnownLength(
+        None if card is None else load_record(card),
+        distance_m,
+        width_m,
+        pose_of("--car", car, "1.2,-0.4,3.1"),
+    )
     found = measure(source, record, attack, camera, known)
     rows = table("of the print", "measured")
     for name, text in found.measurement.lines:
@@ -161,19 +166,6 @@ def attack_measure(
         effect = _effect(request, attack, record, found)
         print(effect.text)
     print(f"written: {', '.join(map(str, write_measured(found, effect, target)))}")
-
-
-def _pose(text: str | None) -> tuple[float, float, float] | None:
-    from advnerf_core.strict import within_a_turn
-    from nodes.runtime.errors import ConfigError
-
-    if text is None:
-        return None
-    x_m, y_m, yaw_rad = numbers_of("--car", text, 3, "X,Y,YAW in metres and radians", "1.2,-0.4,3.1")
-    try:
-        return x_m, y_m, within_a_turn(yaw_rad)
-    except ValueError as error:
-        raise ConfigError(f"--car {text}: {error}") from None
 
 
 def _effect(request: Path, attack: AttackFile, record: PrintRecord, found: MeasuredPrint) -> PrintEffect:

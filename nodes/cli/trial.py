@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes.runtime.terminal import LaunchFile, Overrides, numbers_of, print_table, table
+from nodes.runtime.terminal import LaunchFile, Overrides, pose_of, print_table, table
 
 if TYPE_CHECKING:
     from nodes.lab.trials.plan import PlannedDrive
@@ -58,7 +58,7 @@ def trial(
         repeats,
         seed,
         ticks,
-        None if start is None else _pose(start),
+        pose_of("--start", start, "-1.1,-2.0,0"),
         host,
     )
     count = len(series.plan.runs)
@@ -155,11 +155,6 @@ def _attacks(texts: list[str]) -> dict[str, list[Path]]:
             )
         attacks.setdefault(condition, []).append(Path(file).resolve())
     return attacks
-
-
-def _pose(text: str) -> tuple[float, float, float]:
-    x_m, y_m, yaw_rad = numbers_of("--start", text, 3, "X,Y,YAW in metres and radians", "-1.1,-2.0,0")
-    return x_m, y_m, yaw_rad
 
 
 def _print_summary(summary: list[dict[str, Any]]) -> None:

@@ -122,6 +122,19 @@ def numbers_of(option: str, text: str, count: int, form: str, example: str) -> t
     return values
 
 
+def pose_of(option: str, text: str | None, example: str) -> tuple[float, float, float] | None:
+    """The pose of a text ``X,Y,YAW`` in metres and radians; None for None. Anything else, as degrees are, raises `ConfigError`."""
+    from advnerf_core.strict import within_a_turn
+
+    if text is None:
+        return None
+    x_m, y_m, yaw_rad = numbers_of(option, text, 3, "X,Y,YAW in metres and radians", example)
+    try:
+        return x_m, y_m, within_a_turn(yaw_rad)
+    except ValueError as error:
+        raise ConfigError(f"{option} {text}: {error}") from None
+
+
 def table(*columns: str) -> Table:
     """Make an empty table without lines."""
     from rich.table import Table

@@ -43,6 +43,13 @@ def test_poses_points_and_sizes_that_are_not_finite_are_refused(tmp_path, monkey
     assert not list(tmp_path.iterdir())
 
 
+def test_a_start_in_degrees_is_refused(tmp_path, monkeypatch, capsys):
+    trial = f"car trial two_hosts --folder {tmp_path}/trial --start 0,0,90"
+    assert advnerf(monkeypatch, *trial.split()) == 2
+    assert "--start 0,0,90: expected radians, at most a turn of 6.2832, got 90" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("listen", ["localhost:99999", "127.0.0.1:65536"])
 def test_a_port_that_does_not_exist_is_refused(listen):
     """viser said that it serves there."""
