@@ -1,4 +1,4 @@
-"""The commands ``advnerf log ...``: drives that other cars and other software recorded."""
+"""The commands ``advnerf policy log ...``: drives that other cars and other software recorded."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ ERROR_EXIT = 2
 PANELS = {
     "Audit and experiments": ("audit", "demo", "experiment", "verify"),
     "Places and objects": ("scene",),
-    "Policies": ("policy", "log", "attack"),
+    "Policies": ("policy", "attack"),
     "The car": ("launch", "car", "disarm"),
     "Bags and tools": ("bag", "doctor"),
 }
@@ -71,8 +71,8 @@ app.command()(cli_demo.demo)
 app.command()(cli_verify.verify)
 app.add_typer(cli_experiment.app, name="experiment")
 app.add_typer(cli_scene.app, name="scene")
+cli_policy.app.add_typer(cli_log.app, name="log")
 app.add_typer(cli_policy.app, name="policy")
-app.add_typer(cli_log.app, name="log")
 cli_attack.app.command("request")(cli_attack_node.attack_request)
 cli_attack.app.command("cancel")(cli_attack_node.attack_cancel)
 cli_attack.app.command("landscape")(cli_attack_poses.attack_landscape)

@@ -54,7 +54,7 @@ def test_every_path_that_a_command_reads_is_checked_as_it_is_parsed():
         ("scene", "object", "show", "nope"),
         ("attack", "show", "nope"),
         ("policy", "train", "nope", "-o", "out"),
-        ("log", "info", "nope,images=left"),
+        ("policy", "log", "info", "nope,images=left"),
         ("policy", "check", "nope.onnx"),
         ("policy", "eval", "nope:factory", "nope"),
         ("audit", "mine.onnx", "--world", "lab", "--limit", "nope"),

@@ -133,7 +133,7 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
 
 @contextmanager
 def _naming(others: Sequence[str]) -> Iterator[None]:
-    """Name the other images of a bag if the chosen ones, such as depths, cannot be shown: ``log info`` would list them."""
+    """Name the other images of a bag if the chosen ones, such as depths, cannot be shown: ``policy log info`` would list them."""
     try:
         yield
     except MessageError as error:

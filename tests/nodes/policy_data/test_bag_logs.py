@@ -79,7 +79,7 @@ def test_a_bag_is_one_in_capital_letters_too(tmp_path):
 def test_a_bag_that_was_exported_gives_the_same_frames(tmp_path, monkeypatch, labels):
     pytest.importorskip("pyarrow")
     bag = write_bag(tmp_path / "bag")
-    assert advnerf(monkeypatch, "log", "export", str(bag), "-o", str(tmp_path / "set")) == 0
+    assert advnerf(monkeypatch, "policy", "log", "export", str(bag), "-o", str(tmp_path / "set")) == 0
     exported = open_log(tmp_path / "set")
     assert (exported.count, exported.labels, exported.unit.unknown) == (COUNT - 1, "expert", "")
     assert exported.attached() == {"room.yaml": b"x: 1\n"}
@@ -243,6 +243,6 @@ def test_a_damaged_bag_is_one_line(tmp_path, monkeypatch, capsys):
         bag = write_ackermann(tmp_path / f"drive_{form}", form)
         file = bag if bag.is_file() else next(bag.glob("*.db3"))
         file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-        assert advnerf(monkeypatch, "log", "info", str(bag)) == 2
+        assert advnerf(monkeypatch, "policy", "log", "info", str(bag)) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert file.name in line

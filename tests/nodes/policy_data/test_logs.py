@@ -420,7 +420,7 @@ def test_the_commands_train_on_several_logs_and_evaluate_held_out_frames(tmp_pat
     assert "expected frames of" in capsys.readouterr().err
     assert advnerf(monkeypatch, "policy", "train", tub, "-o", str(tmp_path / "none")) == 2
     assert "give --steering-full-rad" in capsys.readouterr().err
-    assert advnerf(monkeypatch, "log", "info", *logs) == 0
+    assert advnerf(monkeypatch, "policy", "log", "info", *logs) == 0
     assert "CSV file of Udacity's simulator" in capsys.readouterr().out
 
 
@@ -436,10 +436,10 @@ def test_the_commands_train_on_several_logs_and_evaluate_held_out_frames(tmp_pat
 )
 def test_what_is_wrong_with_the_times_of_a_log_is_said(tmp_path, monkeypatch, capsys, step_ms, said):
     tub = f"{write_tub_2(tmp_path / 'tub', step_ms=step_ms)},steering-full-rad=0.4"
-    assert advnerf(monkeypatch, "log", "info", tub) == 0
+    assert advnerf(monkeypatch, "policy", "log", "info", tub) == 0
     shown = " ".join(capsys.readouterr().out.split())  # lines are broken where the screen ends
     assert f"12 of 64 x 48, {said}, cam/image_array" in shown
-    assert advnerf(monkeypatch, "log", "export", tub, "-o", str(tmp_path / "out")) == 2
+    assert advnerf(monkeypatch, "policy", "log", "export", tub, "-o", str(tmp_path / "out")) == 2
     refused = capsys.readouterr().err
     assert "expected times of the images of 0.5 to 1000 Hz in " in refused
     assert f"got {said}; give the images per second" in refused
