@@ -80,7 +80,7 @@ def _off_track(rows: list[dict[str, Any]], changed: str, cells: list[CellResult]
         if any(each["scenario"] == scenario for each in rows):
             of = [each for each in cells if (each.scenario, each.victim) == (scenario, _VICTIM)]
             freely = sum(_left_freely(each) for each in of if each.method == _METHOD)
-            yield _off_track_past(rows, scenario, target, changed, freely)
+            yield from _off_track_past(rows, scenario, target, changed, freely)
 
 
 def _left_freely(cell: CellResult) -> int:
@@ -92,7 +92,8 @@ def _left_freely(cell: CellResult) -> int:
 
 def _off_track_past(
     rows: list[dict[str, Any]], scenario: str, target: float, changed: str, freely: int
-) -> LedgerRow:
+) -> Iterator[LedgerRow]:
+    """The share of drives that left the track before they ran into anything, and of those that ran into nothing at all."""
     ours = _row(rows, scenario, _METHOD)
     without = [
         each
@@ -102,15 +103,17 @@ def _off_track_past(
     ]
     off, drives = (sum(each[key] for each in without) for key in ("off_track", "drives"))
     note = (
-        f"{ours['off_track']} of {ours['drives']} drives of {ours['searches']} searches, {freely} of them without running into something afterwards; ran into "
-        f"something: {collisions(ours['collided'])}; "
+        f"{ours['off_track']} of {ours['drives']} drives of {ours['searches']} searches; ran into something: {collisions(ours['collided'])}; "
         f"excess {ours['excess_m']:.3f} m per tick; methods without a gradient: {off} of {drives} drives off the track, "
         f"{sum(sum(each['collided'].values()) for each in without)} ran into something"
     )
-    value = 100.0 * ours["off_track"] / ours["drives"]
     name = scenario.replace("_", " ")
     line = f"the paper's car, {name}{changed}, victim trained with textures: drives off the track past the gradient's attack"
-    return LedgerRow(line, round(value), "%", f">= {target:g} %", value >= target, COMMAND, note)
+    for count, and_then in ((ours["off_track"], ""), (freely, ", which ran into nothing")):
+        value = 100.0 * count / ours["drives"]
+        yield LedgerRow(
+            line + and_then, round(value), "%", f">= {target:g} %", value >= target, COMMAND, note
+        )
 
 
 def _excess(rows: list[dict[str, Any]], changed: str) -> Iterator[LedgerRow]:

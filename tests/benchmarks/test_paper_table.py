@@ -9,39 +9,50 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.page import searched_apart
 from benchmarks.paper_table import PUBLISHED, ledger_rows
 
-CAR, JUNCTION, SIDES = (PUBLISHED / f"paper_{name}" for name in ("car", "junction", "junction_sides"))
+CAR, MONITOR, JUNCTION, SIDES = (
+    PUBLISHED / f"paper_{name}" for name in ("car", "monitor", "junction", "junction_sides")
+)
 
 
-@pytest.mark.parametrize(("scenario", "met"), [("green_screen", True), ("monitor", False)])
-def test_drives_off_the_track_are_those_of_the_cells(scenario, met):
+@pytest.mark.parametrize(
+    ("published", "scenario", "changed", "met"),
+    [
+        (CAR, "green_screen", "", True),
+        (CAR, "monitor", "", False),
+        (MONITOR, "monitor", ", behind the way of a car that leaves the track", True),
+    ],
+)
+def test_drives_off_the_track_are_those_of_the_cells(published, scenario, changed, met):
     cells = [
         each
-        for each in read_cells(CAR)
+        for each in read_cells(published)
         if (each.scenario, each.victim, each.method) == (scenario, "hardened", "gradient")
     ]
     off = [left for cell in cells for left in cell.deployed.off_track]
     hit = [obstacle for cell in cells for obstacle in cell.obstacles("deployed") if obstacle]
-    row = next(
-        each for each in ledger_rows(PUBLISHED) if scenario.replace("_", " ") + ", victim" in each.line
+    row, unharmed = (
+        each
+        for each in ledger_rows(PUBLISHED)
+        if scenario.replace("_", " ") + f"{changed}, victim" in each.line
     )
     assert row.value == round(100.0 * sum(off) / len(off))
     assert row.met is met
-    free = sum(
+    assert row.note.startswith(
+        f"{sum(off)} of {len(off)} drives of 6 searches; ran into something: {len(hit)} ("
+    )
+    free = [
         left and not drive.collided
         for cell in cells
         for left, drive in zip(cell.deployed.off_track, cell.kept["deployed"], strict=True)
-    )
-    assert row.note.startswith(
-        f"{sum(off)} of {len(off)} drives of 6 searches, {free} of them without running into something afterwards; "
-        f"ran into something: {len(hit)} ("
-    )
+    ]
+    assert (unharmed.value, unharmed.met) == (round(100.0 * sum(free) / len(free)), False)
 
 
 def test_the_tests_are_those_of_complete_sets(tmp_path):
     row = ledger_rows(PUBLISHED)[0]
     tests = [
         each
-        for name in (CAR, JUNCTION, SIDES)
+        for name in (CAR, MONITOR, JUNCTION, SIDES)
         for each in json.loads((name / "set" / "set.json").read_text())["primary"]
     ]
     assert (row.value, row.unit, row.met) == (len(tests), f"of {len(tests)}", True)
