@@ -12,15 +12,18 @@ import torch
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
+from advnerf_core.report.cells import Drives, read_cell
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import kept_drives
 from hardware.worlds.world import World
+from nodes.experiment.engine.artefact import PUBLISHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive
 from nodes.experiment.show.drives import deployed_drives, totals
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import dress_cell
+from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.live import LiveNodes, LiveRun, as_drive, drive_until_it_counts
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED, THETA
 from nodes.lab.trials.tries import NotDrivenError
@@ -104,10 +107,11 @@ def cell_data(
     }
     if place is not None:
         try:
-            without = _deployed_part(experiment, space, place, cell.clean, clean, tell)
-            driven = (
-                without if folder == clean else _deployed_part(experiment, space, place, cell, folder, tell)
-            )
+            if folder == clean:
+                driven = without = _deployed_part(experiment, space, place, cell, clean, tell)
+            else:
+                without = _control(experiment, space, place, cell.clean, clean, tell)
+                driven = _deployed_part(experiment, space, place, cell, folder, tell)
         except NotDrivenError as error:
             # Either arm can be the spoiled one. Without both there is nothing to compare, so the cell has no deployed drives at all.
             data["not_driven_live"] = str(error)
@@ -122,6 +126,36 @@ def cell_data(
             **_live_extra(driven["live"]),
         }
     return data
+
+
+def _control(
+    experiment: Experiment,
+    space: Space,
+    place: World | LiveNodes,
+    cell: Cell,
+    folder: Path,
+    tell: Callable[[str], None],
+) -> dict[str, Any]:
+    """Drives without attack: those of this folder, or of a published live control with the same key, else they are driven.
+
+    Live drives differ from run to run, and all cells of a set are compared with one control.
+    """
+    known = (
+        published_control(cell, settings_hash(experiment, cell))
+        if isinstance(place, LiveNodes) and not (folder / DRIVES).exists()
+        else None
+    )
+    if known is not None:
+        return {"total_cte_m": list(known.total_cte_m)}
+    return _deployed_part(experiment, space, place, cell, folder, tell)
+
+
+def published_control(cell: Cell, key: str) -> Drives | None:
+    """The deployed drives of a published control of a victim with this key; None if there is none."""
+    for file in sorted(PUBLISHED.glob(f"*/*_{cell.victim}_{cell.method}_{cell.seed}.json")):
+        if (found := read_cell(file)).settings_hash == key:
+            return found.deployed
+    return None
 
 
 def _drives_of(found: Mapping[str, Any], clean: Mapping[str, Any]) -> dict[str, Any]:
