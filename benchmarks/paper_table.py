@@ -78,8 +78,9 @@ def _tests(tests: list[dict[str, Any]]) -> LedgerRow:
 def _off_track(rows: list[dict[str, Any]], changed: str, cells: list[CellResult]) -> Iterator[LedgerRow]:
     for scenario, target in _OFF_TRACK.items():
         if any(each["scenario"] == scenario for each in rows):
-            of = [each for each in cells if (each.scenario, each.victim) == (scenario, _VICTIM)]
-            freely = sum(_left_freely(each) for each in of if each.method == _METHOD)
+            wanted = (scenario, _VICTIM, _METHOD)
+            ours = [each for each in cells if (each.scenario, each.victim, each.method) == wanted]
+            freely = sum(map(_left_freely, ours))
             yield from _off_track_past(rows, scenario, target, changed, freely)
 
 

@@ -91,7 +91,7 @@ def search_cell(experiment, cell, folder, report, bench=None):
     (folder / "searched").touch()
 
 
-def run_cell(experiment, cell, folder, report, bench=None):
+def run_cell(experiment, cell, folder, report, bench=None, control_m=()):
     _require_path(experiment, cell)
     _note(folder, f"begin {folder.name} {cell.code} {os.environ.get('OMP_NUM_THREADS')}")
     run = folder.parent.parent
@@ -116,7 +116,7 @@ def run_cell(experiment, cell, folder, report, bench=None):
     found = {"attack_id": None, "surrogate": drives, "extra": {"horizon": 20}}
     if (run / "late").exists() and cell.method == "gradient":
         return {**found, "not_driven_live": "live0 was spoiled 3 times, at last: late"}
-    return {**found, "deployed": drives}
+    return {**found, "deployed": {**drives, "none_total_cte_m": list(control_m) or [none]}}
 
 
 def _searched(cell):

@@ -8,6 +8,7 @@ from pathlib import Path
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import NONE
 from advnerf_core.scene.gate_limits import GateLimits
+from nodes.experiment.engine.artefact import PUBLISHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import has_learned_scene
 from nodes.experiment.run.store import Store
@@ -41,10 +42,14 @@ def _judge(experiment: Experiment, cell: Cell, leave_out: bool, say: Callable[[s
         each for each in (*experiment.cells, cell.clean) if each.method == NONE and gate_key(each) == key
     )
     which = (of, without.inside, limits)
-    found = [cached_verdict(*which, gate_file(experiment.folder, key))]
+    published = PUBLISHED / experiment.config.name
+    # Its variants share the verdict on held-out views, each under its own name.
+    held_out = [file for file in sorted(published.glob("gate/*.json")) if not file.stem.endswith(".drive")]
+    found = [cached_verdict(*which, gate_file(experiment.folder, key), published=held_out)]
     try:
         drive = Store(experiment.folder).work(without.name)
-        found.append(cached_verdict(*which, gate_file(experiment.folder, key, drive=True), drive))
+        file, also = (gate_file(folder, key, drive=True) for folder in (experiment.folder, published))
+        found.append(cached_verdict(*which, file, drive, [also]))
     except RuntimeFault as fault:
         say(
             f"fidelity gate, {key}: only held-out views are judged, as there is no drive without attack yet: {fault}"

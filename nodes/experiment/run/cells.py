@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from functools import cached_property, partial
 from pathlib import Path
@@ -67,7 +68,12 @@ class Bench:
 
 
 def run_cell(
-    experiment: Experiment, cell: Cell, folder: Path, report: Report, bench: Bench | None = None
+    experiment: Experiment,
+    cell: Cell,
+    folder: Path,
+    report: Report,
+    bench: Bench | None = None,
+    control_m: Sequence[float] = (),
 ) -> dict[str, Any]:
     """Search, drive in both domains, and film; resumes from the content of ``folder``.
 
@@ -75,6 +81,7 @@ def run_cell(
         experiment: Experiment with finished scene, objects and policies (``advnerf experiment run FILE --until policy``).
         folder: Folder of this cell, for search state, attack file, drives and film.
         bench: Common resources of cells; None makes them.
+        control_m: Total CTE of the deployed drives without attack [m], if it was driven already; see `worker.Job`.
 
     Returns:
         The cell as JSON data: see `deploy.cell_data`.
@@ -90,7 +97,7 @@ def run_cell(
         tell = partial(report, SEARCHED_SHARE)
         tell("driving")
         driven = clean if cell.method == NONE else folder
-        data = cell_data(experiment, shared.space, shared.deployed_in, cell, driven, clean, tell)
+        data = cell_data(experiment, shared.space, shared.deployed_in, cell, driven, clean, tell, control_m)
         if shared.deployed_in is None or "not_driven_live" in data:
             return data
         film = kept_film(folder) or film_cell(experiment, shared.scene, shared.space, cell, folder, driven)

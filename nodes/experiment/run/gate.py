@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,13 +51,21 @@ def judge_scene(
 
 
 def cached_verdict(
-    experiment: Experiment, cell: Cell, limits: GateLimits, file: Path, drive: Path | None = None
+    experiment: Experiment,
+    cell: Cell,
+    limits: GateLimits,
+    file: Path,
+    drive: Path | None = None,
+    published: Sequence[Path] = (),
 ) -> Verdict:
     """The verdict on held-out views, or on a drive; judged again only if scene, policy or limits changed.
+
+    A set has one verdict on a scene and victim, so that a published one is taken over: judged on another machine, its last digits differ.
 
     Args:
         cell: The cell without attack that has the drive, with its name in the experiment.
         drive: Folder of the cell, if its drive is to be judged.
+        published: Files that may have the verdict, besides its own.
 
     Raises:
         RuntimeFault: The drive does not exist yet.
@@ -65,8 +74,11 @@ def cached_verdict(
     which = [cell.scenario, cell.victim, *(["drive", cell.seed] if drive else [])]
     stages = digests_in(experiment.folder, stages_needed(experiment.config, cell.victim))
     key = hash_of([stages, _weights_sha256(policy), limits.model_dump(mode="json"), *which])
-    if (kept := read_current(file, key=key)) is not None:
-        return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
+    for known in (file, *published):
+        if (kept := read_current(known, key=key)) is not None:
+            if known != file:
+                write_json(file, kept)
+            return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
     pictures = (
         fidelity.driven(experiment, cell, clean_folder(experiment, cell, drive))
         if drive

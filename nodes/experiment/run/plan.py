@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from advnerf_core.report.cells import read_cell
+from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.registration import (
     FILE,
     RegisteredCell,
@@ -43,9 +45,20 @@ def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Job]:
             threads=1,
             registration=registered_under(registration, cell, registered_settings(of)),
             alone=runs_alone(of),
+            control_m=_published_control_m(experiment, cell),
         )
         planned.append(job)
     return planned
+
+
+def _published_control_m(experiment: Experiment, cell: Cell) -> tuple[float, ...]:
+    """Total CTE of each start of the control with which the set's published cells are compared [m]; empty without one that was driven live."""
+    of, file = experiment.of(cell), _published_file(experiment, cell.clean)
+    if cell.method == NONE or not of.config.deploy.live or not file.exists():
+        return ()
+    control = read_cell(file)
+    same = control.settings_hash == settings_hash(of, cell.inside.clean)
+    return control.deployed.total_cte_m if same and control.deployed is not None else ()
 
 
 def registered_under(registration: Registration | None, cell: Cell, settings: Settings) -> str:
@@ -95,8 +108,13 @@ def statuses(experiment: Experiment, cells: Sequence[Cell]) -> list[CellStatus]:
 def elsewhere(experiment: Experiment, cell: Cell) -> list[Path]:
     """Further files that may have a cell's result: in its variant's run folder, and in the folder of cells stored with the code."""
     own = experiment.folder_of(cell) / CELLS / f"{cell.inside.name}.json"
-    kept = PUBLISHED / experiment.config.name / f"{cell.name}.json"
+    kept = _published_file(experiment, cell)
     return [kept] if own == Store(experiment.folder).result_file(cell.name) else [own, kept]
+
+
+def _published_file(experiment: Experiment, cell: Cell) -> Path:
+    """File of a cell's result with the code; it need not exist."""
+    return PUBLISHED / experiment.config.name / f"{cell.name}.json"
 
 
 def current_key(experiment: Experiment, cell: Cell) -> str | None:

@@ -58,6 +58,8 @@ class Job:
         phase: ``search``: only the part that may run beside others; ``whole``: all of it.
         registration: Digest of the registration that it is run under; empty without one.
         alone: Whether it needs the machine for itself, see `runs_alone`.
+        control_m: Total CTE of each live drive of the set's published control [m]; empty without one. Live drives differ from run to run, and
+            all cells of a set are compared with one control.
     """
 
     folder: str
@@ -70,6 +72,7 @@ class Job:
     phase: Phase = "whole"
     registration: str = ""
     alone: bool = False
+    control_m: tuple[float, ...] = ()
 
     @property
     def name(self) -> str:
@@ -80,7 +83,8 @@ class Job:
     def from_json(cls, text: str) -> Job:
         """The job from the `json.dumps` of its values."""
         data = json.loads(text)
-        return cls(**{**data, "overrides": tuple(data["overrides"]), "cell": Cell(**data["cell"])})
+        read = {name: tuple(data[name]) for name in ("overrides", "control_m")}
+        return cls(**{**data, **read, "cell": Cell(**data["cell"])})
 
 
 @dataclass(frozen=True)
@@ -236,7 +240,7 @@ def _run(
         search_cell(experiment, job.cell.inside, work, report, bench)
         _add_seconds(work, time.monotonic() - began)
         return
-    found = run_cell(experiment, job.cell.inside, work, report, bench)
+    found = run_cell(experiment, job.cell.inside, work, report, bench, job.control_m)
     ours = {
         "scenario": job.cell.scenario,
         "victim": job.cell.victim,

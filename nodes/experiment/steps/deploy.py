@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +12,15 @@ import torch
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.report.cells import Drives, read_cell
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import kept_drives
 from hardware.worlds.world import World
-from nodes.experiment.engine.artefact import PUBLISHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive
 from nodes.experiment.show.drives import deployed_drives, totals
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import dress_cell
-from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.live import LiveNodes, LiveRun, as_drive, drive_until_it_counts
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED, THETA
 from nodes.lab.trials.tries import NotDrivenError
@@ -72,6 +69,7 @@ def cell_data(
     folder: Path,
     clean: Path,
     tell: Callable[[str], None],
+    control_m: Sequence[float] = (),
 ) -> dict[str, Any]:
     """Drive a searched cell, and without attack, in the deployment, and assemble the result.
 
@@ -80,6 +78,7 @@ def cell_data(
         folder: The cell's folder, with the surrogate's part.
         clean: The folder of the same drive without attack, with the surrogate's part.
         tell: Called with a message for each drive that does not count.
+        control_m: Total CTE of each start without attack [m], if it was driven already; see `worker.Job`.
 
     Returns:
         Attack id, seconds; for ``surrogate`` and ``deployed`` the total CTE [m] and whether the car left the track, per start, and the total
@@ -94,7 +93,7 @@ def cell_data(
         "attack_id": learned["attack_id"],
         "seconds": round(learned["seconds"], 1),
         "policy_sha256": learned["policy_sha256"],
-        "surrogate": _drives_of(learned, undisturbed),
+        "surrogate": _drives_of(learned, undisturbed["total_cte_m"]),
         "kept": {"surrogate": kept_drives(learned)},
         "extra": {
             "evaluations": len(learned["curve_total_cte_m"]),
@@ -107,17 +106,16 @@ def cell_data(
     }
     if place is not None:
         try:
-            if folder == clean:
-                driven = without = _deployed_part(experiment, space, place, cell, clean, tell)
-            else:
-                without = _control(experiment, space, place, cell.clean, clean, tell)
-                driven = _deployed_part(experiment, space, place, cell, folder, tell)
+            without_m = (
+                control_m or _deployed_part(experiment, space, place, cell.clean, clean, tell)["total_cte_m"]
+            )
+            driven = _deployed_part(experiment, space, place, cell, folder, tell)
         except NotDrivenError as error:
             # Either arm can be the spoiled one. Without both there is nothing to compare, so the cell has no deployed drives at all.
             data["not_driven_live"] = str(error)
             data["extra"]["spoiled_tries"] = [list(error.spoiled)]
             return data
-        data["deployed"] = _drives_of(driven, without)
+        data["deployed"] = _drives_of(driven, without_m)
         data["kept"]["deployed"] = kept_drives(driven)
         data["extra"] |= {
             "blocked_tick": driven["blocked_tick"],
@@ -128,41 +126,11 @@ def cell_data(
     return data
 
 
-def _control(
-    experiment: Experiment,
-    space: Space,
-    place: World | LiveNodes,
-    cell: Cell,
-    folder: Path,
-    tell: Callable[[str], None],
-) -> dict[str, Any]:
-    """Drives without attack: those of this folder, or of a published live control with the same key, else they are driven.
-
-    Live drives differ from run to run, and all cells of a set are compared with one control.
-    """
-    known = (
-        published_control(cell, settings_hash(experiment, cell))
-        if isinstance(place, LiveNodes) and not (folder / DRIVES).exists()
-        else None
-    )
-    if known is not None:
-        return {"total_cte_m": list(known.total_cte_m)}
-    return _deployed_part(experiment, space, place, cell, folder, tell)
-
-
-def published_control(cell: Cell, key: str) -> Drives | None:
-    """The deployed drives of a published control of a victim with this key; None if there is none."""
-    for file in sorted(PUBLISHED.glob(f"*/*_{cell.victim}_{cell.method}_{cell.seed}.json")):
-        if (found := read_cell(file)).settings_hash == key:
-            return found.deployed
-    return None
-
-
-def _drives_of(found: Mapping[str, Any], clean: Mapping[str, Any]) -> dict[str, Any]:
+def _drives_of(found: Mapping[str, Any], without_m: Sequence[float]) -> dict[str, Any]:
     return {
         "total_cte_m": found["total_cte_m"],
         "off_track": found["off_track"],
-        "none_total_cte_m": clean["total_cte_m"],
+        "none_total_cte_m": list(without_m),
     }
 
 

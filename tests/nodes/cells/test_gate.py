@@ -71,6 +71,25 @@ def test_a_verdict_is_made_again_only_for_other_limits(gated):
     assert times_judged(gated) == 3
 
 
+def test_a_published_verdict_on_the_same_scene_and_victim_is_taken_over(gated, monkeypatch):
+    """Under the name of any variant: judged on another machine, its last digits differ, and a set has one."""
+    monkeypatch.chdir(gated.folder)
+    run(gated)
+    judged = gated.folder / "gate" / "straight_hardened.json"
+    verdict = json.loads(judged.read_text())
+    verdict["numbers"]["steering"] = 1e-9
+    published = gated.folder / "docs" / "results" / "toy" / "gate" / "straight_too_hardened.json"
+    published.parent.mkdir(parents=True)
+    published.write_text(json.dumps(verdict))
+    judged.unlink()
+    run(gated)
+    assert times_judged(gated) == 1
+    assert json.loads(judged.read_text()) == verdict
+    gated.write(gate={"views": 15}, **ONE)
+    run(gated)
+    assert times_judged(gated) == 2
+
+
 def test_a_drive_without_attack_is_judged_too_as_soon_as_there_is_one(gated):
     gated.write(**ONE)
     gated.describe(none_m=2.0, late=1.0, wrong_drive=0.2)

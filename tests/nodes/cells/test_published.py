@@ -195,6 +195,35 @@ def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_pat
     assert [end.name for end in ended] == [second.stem]
 
 
+def test_a_resumed_live_cell_is_compared_with_the_published_control_of_its_own_set(
+    here, tmp_path, monkeypatch
+):
+    """Live drives differ from run to run: a control that was driven again, or that of another set with the same key, is not this set's."""
+    monkeypatch.chdir(tmp_path)
+    live = {"run_folder": str(here.folder / "run"), "carrier.kind": "overlay", "deploy.through": "nodes"}
+    here.write(seed=[0], method=["none", "gradient"], variants={"live": live})
+    loaded, kept = here.load(), tmp_path / "docs" / "results"
+
+    def compared():
+        return {each.cell.name: each.control_m for each in plan_cells(loaded, loaded.cells) if each.control_m}
+
+    none = next(each for each in plan_cells(loaded, loaded.cells) if each.cell.name == "live_hardened_none_0")
+    for name, total_m in (("another", 7.0), ("toy", 6.5)):
+        assert compared() == {}
+        drives = {"total_cte_m": [total_m], "off_track": [True], "none_total_cte_m": [total_m]}
+        put(none, kept / name, deployed=drives)
+    assert compared() == {"live_hardened_gradient_0": (6.5,)}
+    run_cells(loaded, loaded.cells, Options(here=True), lambda text: None)
+    found = {
+        name: json.loads((here.cells / f"{name}_hardened_gradient_0.json").read_text())["deployed"]
+        for name in ("straight", "live")
+    }
+    assert found["live"]["none_total_cte_m"] == [6.5]
+    assert found["straight"]["none_total_cte_m"] == [2.0]
+    put(none, kept / "toy", "of other settings")
+    assert compared() == {}
+
+
 def test_a_cell_that_its_experiment_has_run_is_done_for_a_variant_too(here):
     loaded = here.load()
     plan = plan_cells(loaded, loaded.cells)

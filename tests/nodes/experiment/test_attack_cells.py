@@ -172,6 +172,13 @@ def test_cell_has_both_domains_over_their_own_clean_drive(fresh: Experiment, wal
     assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(cte_m).sum()])
     assert (clean / DRIVES).exists()
     assert cell["extra"]["blocked_tick"] == [None]
+    assert cell["deployed"]["none_total_cte_m"] == json.loads((clean / DRIVES).read_text())["total_cte_m"]
+    # A control that was driven elsewhere is not driven here.
+    (clean / DRIVES).unlink()
+    arguments = (fresh, colour_space(fresh), wall, GRADIENT, folder, clean, print, (0.25,))
+    assert cell_data(*arguments)["deployed"] == {**cell["deployed"], "none_total_cte_m": [0.25]}
+    assert not (clean / DRIVES).exists()
+    assert finished(fresh, wall, GRADIENT) == cell
     # Once there, it is not driven again: here it would end where it starts.
     blocking = replace(wall, blocked_beyond_m=-1e3)
     assert finished(fresh, blocking, GRADIENT) == cell

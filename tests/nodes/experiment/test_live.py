@@ -10,9 +10,7 @@ import pytest
 
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
-from nodes.experiment.plan.cell import Cell
 from nodes.experiment.steps import live
-from nodes.experiment.steps.deploy import published_control
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
 from nodes.lab.trials.trial import SpoiledError
@@ -155,20 +153,3 @@ def test_live_nodes_simulate_the_lab_alone(tmp_path):
         load_experiment(
             junction, "demo", ["deploy.through=nodes", "carrier.kind=overlay", "objects=[]"], tmp_path
         )
-
-
-def test_a_resumed_set_keeps_its_published_control(tmp_path, monkeypatch):
-    """Live drives differ from run to run; a control that was driven again made the set unpublishable."""
-    cells = [
-        json.loads((Path("docs/results/imperfect_camera") / f"live_hardened_{name}.json").read_text())
-        for name in ("none_0", "gradient_0", "gradient_1", "gradient_2")
-    ]
-    control = cells[0]
-    found = published_control(Cell("track", "hardened", "none", 0), control["settings_hash"])
-    assert found is not None
-    assert all(list(found.total_cte_m) == each["deployed"]["none_total_cte_m"] for each in cells)
-    # Neither that of other settings nor a cell past an attack is it.
-    assert published_control(Cell("track", "hardened", "none", 0), "0" * 64) is None
-    assert published_control(Cell("track", "hardened", "none", 0), cells[1]["settings_hash"]) is None
-    monkeypatch.chdir(tmp_path)
-    assert published_control(Cell("track", "hardened", "none", 0), control["settings_hash"]) is None
