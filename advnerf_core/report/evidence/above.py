@@ -21,8 +21,8 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.about import ObjectPlace, read_about
 from advnerf_core.report.evidence.page import above_of, film_of, filmed_of, maps_of
-from advnerf_core.report.evidence.registration import PrimaryTest
 from advnerf_core.report.evidence.results import Evidence, read_evidence
+from advnerf_core.report.evidence.rows import Key
 from advnerf_core.report.evidence.verifying.layout import SET
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import STYLE
@@ -61,12 +61,12 @@ class DriveGroup:
     @property
     def label(self) -> str:
         """The condition and how its drives ended."""
-        hit = f", {self.collided} ran into something" if self.collided else ""
+        hit = f", {self.collided} collided" if self.collided else ""
         return f"{self.title}: {self.off_track} of {len(self.poses)} off track{hit}"
 
 
 def write_above_of(folder: Path) -> Path | None:
-    """Write the picture of a published set beside its folder; None if it has no primary test and no claim.
+    """Write the picture of a published set beside its folder; None if it has no primary test, claim or contrast.
 
     Of a set whose scenarios share their searches the last one is drawn, with stills of its film; otherwise one map for each.
     """
@@ -77,7 +77,7 @@ def write_above_of(folder: Path) -> Path | None:
     about = read_about(folder.parent).get(folder.name)
     film, target = folder.parent / film_of(folder.name), folder.parent / above_of(folder.name)
     evidence = read_evidence(folder)
-    if len(maps) > 1:
+    if len(maps) > 1 or not data["primary"]:
         return write_maps(evidence, maps, target)
     place = about.object if about else None
     return write_above(evidence, data["primary"][-1], filmed_of(data), place, film, target)
@@ -88,15 +88,17 @@ def write_maps(evidence: Evidence, maps: Sequence[Sequence[Mapping[str, Any]]], 
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor="white")
         for number, shown in enumerate(maps):
-            test = PrimaryTest.model_validate(shown[0]["test"])
+            scenario, placement, *_ = _key(shown[0])
             groups = groups_of_drives(evidence, shown)
-            registered = evidence.registration.scenario(test.scenario, test.placement)
+            registered = evidence.registration.scenario(scenario, placement)
             assert registered is not None, "the test was registered"
             share = (1.0 - _LEFT) / len(maps)
             left, width = _LEFT + (number + _MARGIN) * share, (1.0 - 1.2 * _MARGIN) * share
             ax = figure.add_axes((left, 0.36, width, 0.46))
             _draw_map(ax, groups, registered.reference_path(), registered.off_track_m, None)
-            ax.set_title(" ".join(filter(None, (test.scenario, test.placement))).replace("_", " "), pad=60)
+            ax.set_title(
+                " ".join(filter(None, (scenario, placement))).replace("_", " "), pad=20 * len(groups)
+            )
             ax.legend(handles=_handles(groups), loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
             below = figure.add_axes((left, 0.085, width, 0.15))
             _draw_deviation(below, groups, registered.off_track_m, registered.dt_s)
@@ -120,9 +122,9 @@ def write_above(
 
     Both are primary tests from ``set.json``. Without the position of the object, or without a film, the picture lacks these.
     """
-    test = PrimaryTest.model_validate(shown["test"])
+    scenario, placement, *_ = _key(shown)
     groups = groups_of_drives(evidence, [shown])
-    registered = evidence.registration.scenario(test.scenario, test.placement)
+    registered = evidence.registration.scenario(scenario, placement)
     assert registered is not None, "the test was registered"
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor="white")
@@ -134,9 +136,9 @@ def write_above(
     return target
 
 
-def moment_of(evidence: Evidence, test: PrimaryTest) -> tuple[float, bool]:
+def moment_of(evidence: Evidence, key: Key) -> tuple[float, bool]:
     """Time [s] at which the first deployed drive of the first search leaves the track, or deviates most; and whether it left."""
-    cell = evidence.searches((test.scenario, test.placement, test.victim, test.method))[0]
+    cell = evidence.searches(key)[0]
     metrics = evidence.metrics(cell, "deployed")[0]
     if metrics.time_to_leaving_s is not None:
         return metrics.time_to_leaving_s, True
@@ -145,26 +147,26 @@ def moment_of(evidence: Evidence, test: PrimaryTest) -> tuple[float, bool]:
 
 
 def groups_of_drives(evidence: Evidence, shown: Sequence[Mapping[str, Any]]) -> list[DriveGroup]:
-    """Drives past the plain object, the strongest baseline and the attack, of all victims."""
-    tests = [PrimaryTest.model_validate(each["test"]) for each in shown]
-    method, baselines = tests[0].method, [str(each["baseline"]) for each in shown]
+    """Drives past the plain object, the strongest baseline, where there is one, and the attack, of all victims."""
+    keys = [_key(each) for each in shown]
+    # Fixed colours of different lightness, for any method.
+    plain = _group(evidence, style_of(NONE).title, LIGHT[NONE], [(*key[:3], NONE) for key in keys])
+    attack = _group(evidence, style_of(keys[0][3]).title, LIGHT["gradient"], keys)
+    baselines = [str(each["baseline"]) for each in shown if each["baseline"]]
+    if not baselines:
+        return [plain, attack]
     strongest = style_of(baselines[0]).title if len(set(baselines)) == 1 else "strongest baseline"
-    # Three fixed colours of different lightness, for any method.
-    return [
-        _group(evidence, style_of(NONE).title, LIGHT[NONE], tests, [NONE] * len(tests)),
-        _group(evidence, strongest, LIGHT["random"], tests, baselines),
-        _group(evidence, style_of(method).title, LIGHT["gradient"], tests, [method] * len(tests)),
-    ]
+    of_baselines = [(*key[:3], baseline) for key, baseline in zip(keys, baselines, strict=True)]
+    return [plain, _group(evidence, strongest, LIGHT["random"], of_baselines), attack]
 
 
-def _group(
-    evidence: Evidence, title: str, colour: str, tests: Sequence[PrimaryTest], methods: Sequence[str]
-) -> DriveGroup:
-    cells = [
-        cell
-        for test, method in zip(tests, methods, strict=True)
-        for cell in evidence.searches((test.scenario, test.placement, test.victim, method))
-    ]
+def _key(shown: Mapping[str, Any]) -> Key:
+    test = shown["test"]
+    return test["scenario"], test["placement"], test["victim"], test["method"]
+
+
+def _group(evidence: Evidence, title: str, colour: str, keys: Sequence[Key]) -> DriveGroup:
+    cells = [cell for key in keys for cell in evidence.searches(key)]
     metrics = [each for cell in cells for each in evidence.metrics(cell, "deployed")]
     poses = [drive.poses() for cell in cells for drive in cell.kept["deployed"]]
     off = sum(each.off_track for each in metrics)
@@ -246,7 +248,7 @@ def _draw_deviation(ax: Any, groups: Sequence[DriveGroup], off_track_m: float, d
 
 def _draw_stills(figure: Figure, evidence: Evidence, filmed: Mapping[str, Any], film: Path) -> None:
     """Camera images at the key moment and a second before: above with the attack, below past the plain object."""
-    when_s, left = moment_of(evidence, PrimaryTest.model_validate(filmed["test"]))
+    when_s, left = moment_of(evidence, _key(filmed))
     moment = "it leaves the track" if left else "it deviates most"
     for at_s, x in zip((max(when_s - _BEFORE_S, 0.0), when_s), _STILLS_LEFT, strict=True):
         views = _frame_at(film, at_s) if film.exists() else None

@@ -18,17 +18,22 @@ class ContrastRow:
     """One contrast of one method against one victim.
 
     Attributes:
+        before: Condition before.
+        after: Condition after.
         before_m: Mean excess |CTE| per tick under the first condition [m].
         after_m: The same under the second, over the same searches and starts [m].
         difference_m: After minus before, paired by search and start [m].
         low_m: Lower end of its interval [m]; None with too few drives.
         high_m: Upper end [m].
-        searches: Searches under both conditions.
+        searches: Searches whose attack was driven under both conditions.
+        other_attacks: Searches that found another attack under the second condition, which are left out.
         drives: Pairs of drives.
         registered: Whether all cells were registered; else it is exploration.
     """
 
     name: str
+    before: str
+    after: str
     victim: str
     method: str
     before_m: float
@@ -37,12 +42,13 @@ class ContrastRow:
     low_m: float | None
     high_m: float | None
     searches: int
+    other_attacks: int
     drives: int
     registered: bool
 
 
 def contrast_rows(evidence: Evidence) -> list[ContrastRow]:
-    """All registered contrasts, for each victim and method with searches under both conditions."""
+    """All registered contrasts, for each victim and method with attacks that were driven under both conditions."""
     found = []
     for contrast in evidence.registration.contrasts:
         keys = dict.fromkeys(
@@ -68,9 +74,10 @@ def _row(evidence: Evidence, contrast: Contrast, victim: str, method: str) -> Co
         {cell.seed: cell for cell in evidence.searches((scenario, "", victim, method))}
         for scenario in (contrast.before, contrast.after)
     )
-    pairs = [(before[seed], after[seed]) for seed in sorted(before.keys() & after.keys())]
+    found = [(before[seed], after[seed]) for seed in sorted(before.keys() & after.keys())]
     # Another attack under the second condition would add a second difference.
-    if not pairs or any(one.attack_id != other.attack_id for one, other in pairs):
+    pairs = [(one, other) for one, other in found if one.attack_id == other.attack_id]
+    if not pairs:
         return None
     values = [
         [evidence.excesses_m(one, contrast.before_in), evidence.excesses_m(other, contrast.after_in)]
@@ -83,6 +90,8 @@ def _row(evidence: Evidence, contrast: Contrast, victim: str, method: str) -> Co
     interval = clustered_interval(list(second - first), evidence.registration.level)
     return ContrastRow(
         contrast.name,
+        contrast.before,
+        contrast.after,
         victim,
         method,
         before_m=float(first.mean()),
@@ -91,6 +100,7 @@ def _row(evidence: Evidence, contrast: Contrast, victim: str, method: str) -> Co
         low_m=interval.low if interval else None,
         high_m=interval.high if interval else None,
         searches=len(pairs),
+        other_attacks=len(found) - len(pairs),
         drives=second.size,
         registered=all(evidence.is_registered(cell) for pair in pairs for cell in pair),
     )

@@ -131,8 +131,9 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
         parts += [*(f"{each}\n" for each in said), _tests(data["primary"])]
     parts += [_table(registered), f"![Excess of every drive, by method and domain]({picture_of(name)})\n"]
     if data["filmed"]:
+        baseline = ["the strongest baseline"] if filmed_of(data)["baseline"] else []
         parts.append(
-            f"![Drives past the plain object, the strongest baseline and the attack]({film_of(name)})\n\n"
+            f"![Drives past {', '.join(['the plain object', *baseline])} and the attack]({film_of(name)})\n\n"
             f"*Film: {_filmed(data)}.*\n"
         )
     if data.get("contrasts"):
@@ -156,10 +157,12 @@ def searched_apart(primary: Sequence[Mapping[str, Any]]) -> list[Mapping[str, An
 
 
 def maps_of(data: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
-    """The maps in the picture of a set by its ``set.json``, each with the tests whose drives it shows: one for each of `searched_apart`, and for each
-    place of a claim one of all victims; none without tests and claims."""
+    """The maps in the picture of a set by its ``set.json``, each with the tests whose drives it shows: one for each of `searched_apart`; without tests
+    one for each place of a claim, of all victims; without claims one for each condition of a contrast, which has no baseline."""
     if data["primary"]:
         return [[test] for test in searched_apart(data["primary"])]
+    if not data.get("claims"):
+        return [[condition] for condition in _conditions(data)]
     maps = dict[str, list[Mapping[str, Any]]]()
     for claimed in data.get("claims", ()):
         for each in claimed["each"]:
@@ -169,10 +172,23 @@ def maps_of(data: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
     return list(maps.values())
 
 
+def _conditions(data: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The conditions that contrasts compare, in the form of tests, each with the difference to the one before."""
+    found = dict[str, Mapping[str, Any]]()
+    for row in data.get("contrasts", ()):
+        of_row = {"placement": "", "victim": row["victim"], "method": row["method"], "against": []}
+        for end, difference_m in (("before", 0.0), ("after", row["difference_m"])):
+            test = {"scenario": row[end], **of_row}
+            found.setdefault(row[end], {"test": test, "baseline": None, "difference_m": difference_m})
+    return list(found.values())
+
+
 def filmed_of(data: Mapping[str, Any]) -> Mapping[str, Any]:
     """The test from ``set.json`` whose drives are filmed: the first one; of scenarios with searches of their own the one with the largest difference."""
     apart = [test for tests in maps_of(data) for test in tests]
-    return max(apart, key=lambda test: test["difference_m"] or 0.0) if len(apart) > 1 else data["primary"][0]
+    if len(apart) > 1:
+        return max(apart, key=lambda test: test["difference_m"] or 0.0)
+    return (data["primary"] or apart)[0]
 
 
 def _filmed(data: Mapping[str, Any]) -> str:
@@ -184,7 +200,7 @@ def _picture(name: str, data: Mapping[str, Any]) -> list[str]:
     maps = maps_of(data)
     if not maps:
         return []
-    if len(maps) > 1:
+    if len(maps) > 1 or not data["primary"]:
         return [f"![All deployed drives of each scenario from above]({above_of(name)})\n"]
     shown, filmed = (place_of(each["test"]) for each in (data["primary"][-1], filmed_of(data)))
     stills = f" Stills: {filmed}." if data["filmed"] else ""
@@ -282,7 +298,8 @@ def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:
                 "what differs": row["name"] + ("" if row["registered"] else " (not registered)"),
                 "victim": row["victim"],
                 "attack": style_of(row["method"]).title,
-                "searches x starts": f"{row['searches']} x {row['drives'] // row['searches']}",
+                "searches x starts": f"{row['searches']} x {row['drives'] // row['searches']}"
+                + (f" ({row['other_attacks']} with another attack left out)" if row["other_attacks"] else ""),
                 "before [m per tick]": f"{row['before_m']:.3f}",
                 "after": f"{row['after_m']:.3f}",
                 "difference": f"{row['difference_m']:+.3f}",

@@ -1,4 +1,4 @@
-"""The film of a published set: drives without attack, past the strongest baseline, and past the attack, side by side."""
+"""The film of a published set: drives past the plain object, the strongest baseline and the attack, side by side."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _EVERY = 2  # frames, at ten frames a second
 
 
 def write_film(experiment: Experiment, published: Path) -> Path | None:
-    """Write the film of `filmed_of` beside the page; None without a test or claim, or if a clip is not on this machine."""
+    """Write the film of `filmed_of` beside the page; None without a test, claim or contrast, or if a clip is not on this machine."""
     data = read_json(published / SET)
     clips = _clips(experiment, published, filmed_of(data)) if maps_of(data) else []
     if not clips or not all(clip.exists() for clip in clips):
@@ -45,6 +45,7 @@ def _clips(experiment: Experiment, published: Path, test: Mapping[str, Any]) -> 
     searched = [
         evidence.searches((which["scenario"], which["placement"], which["victim"], method))[0]
         for method in (NONE, test["baseline"], which["method"])
+        if method
     ]
     return [experiment.folder / "cells" / str(cell.extra.get("clip", "")) for cell in searched]
 

@@ -101,6 +101,21 @@ def test_another_attack_is_no_contrast(evidence: Evidence) -> None:
     assert {(row.name, row.method) for row in found if row.name == RENDERER.name} == {
         (RENDERER.name, "random")
     }
+    one = [
+        replace(cell, attack_id="another")
+        if (cell.scenario, cell.method, cell.seed) == ("native", "gradient", 2)
+        else cell
+        for cell in evidence.cells.values()
+    ]
+    part = next(
+        row
+        for row in contrast_rows(Evidence(evidence.registration, one))
+        if (row.name, row.method) == (RENDERER.name, "gradient")
+    )
+    assert (part.searches, part.other_attacks, part.drives) == (5, 1, 25)
+    kept = [seed for seed in range(6) if seed != 2]
+    before = excess(evidence, "gradient", "deployed")[kept]
+    assert part.before_m == pytest.approx(before.mean())
     none = evidence.registration.model_copy(update={"contrasts": ()})
     assert contrast_data(Evidence(none, cells)) == {}
     # The digest of a registration from before there were contrasts is over what its file says.
