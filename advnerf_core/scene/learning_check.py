@@ -1,4 +1,4 @@
-"""Checks that a training learns: after some steps it must be better than one colour for all pixels."""
+"""Checks that a training learns: after some steps, and on pictures that it did not see, it must be better than one colour for all pixels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from advnerf_core.data.views import ImageSet
 from advnerf_core.scene.train_config import TrainingReport
 
 AFTER_STEPS = 100
-_BETTER_DB = 1.0
+# Pictures with the inverses of their poses are learned one by one: held-out ones stay near one colour.
+_BETTER_DB, _HELD_OUT_BETTER_DB = 1.0, 3.0
+_CAUSES = "the box, --near, and the poses (axes, unit, from camera to world and not the inverse, one line for each image)"
 # Pictures that are nearly of one colour are no test.
 _PLAIN_DB = 35.0
 _MOST_PIXELS = 1 << 20
@@ -20,7 +22,7 @@ class LearningCheck:
 
     def __init__(self, images: ImageSet) -> None:
         self._one_colour_db = one_colour_db(images)
-        self._done = images.alpha is not None or self._one_colour_db > _PLAIN_DB
+        self._done = _says_nothing(images, self._one_colour_db)
 
     def __call__(self, at: TrainingReport) -> str | None:
         """A sentence about the problem, at the first report after 100 steps; None if there is no problem."""
@@ -31,8 +33,29 @@ class LearningCheck:
             return None
         return (
             f"after {at.step} steps nothing is learned: {at.psnr_db:.1f} dB on training rays, one colour for all gives "
-            f"{self._one_colour_db:.1f} dB; check the box, --near, and the poses (axes, unit, one line for each image)"
+            f"{self._one_colour_db:.1f} dB; check {_CAUSES}"
         )
+
+
+def held_out_problem(psnr_db: float, images: ImageSet) -> str | None:
+    """A sentence if a finished scene shows held-out pictures hardly better than one colour; None otherwise.
+
+    Args:
+        psnr_db: Mean PSNR of the pictures [dB].
+        images: The pictures.
+    """
+    plain_db = one_colour_db(images)
+    if _says_nothing(images, plain_db) or psnr_db > plain_db + _HELD_OUT_BETTER_DB:
+        return None
+    return (
+        f"held-out pictures reach {psnr_db:.1f} dB, one colour for all gives {plain_db:.1f} dB: the scene is no copy of the place; train longer, or "
+        f"check {_CAUSES}"
+    )
+
+
+def _says_nothing(images: ImageSet, plain_db: float) -> bool:
+    """Whether a comparison with one colour is no test."""
+    return images.alpha is not None or plain_db > _PLAIN_DB
 
 
 def one_colour_db(images: ImageSet) -> float:

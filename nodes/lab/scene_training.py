@@ -21,7 +21,7 @@ from advnerf_core.report.clips import write_video
 from advnerf_core.scene.auto_box import box_around_cameras, box_of_silhouettes
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
-from advnerf_core.scene.learning_check import LearningCheck
+from advnerf_core.scene.learning_check import LearningCheck, held_out_problem
 from advnerf_core.scene.metrics import gain_fitted, psnr, ssim
 from advnerf_core.scene.presets import FAST, PHOTOGRAPH_BANDS
 from advnerf_core.scene.presets import PRESETS as SCENE_PRESETS
@@ -84,6 +84,8 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
         write_json(request.output / EXPOSURE, rows)
     figures = evaluate(FieldRenderer.from_file(request.output / SCENE), held_out, compared)
     write_json(request.output / FIGURES, figures)
+    if (told := held_out_problem(figures["mean"]["psnr_db"], compared)) is not None:
+        print(f"warning: {told}", flush=True)
     return figures
 
 

@@ -15,7 +15,7 @@ from advnerf_core.geometry import Pinhole
 from advnerf_core.scene.bake import NotBakedError, bake
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.intervals import pixel_intervals
-from advnerf_core.scene.learning_check import LearningCheck, one_colour_db
+from advnerf_core.scene.learning_check import LearningCheck, held_out_problem, one_colour_db
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, TrainingReport, train_scene
 
@@ -42,8 +42,10 @@ def room(unit, count=12):
     return ImageSet(np.stack(images), (LENS,) * count, np.stack(poses))
 
 
-def learned(unit, **changes):
-    images, side = room(unit), 1.05 * SIDE * unit
+def learned(unit, count=12, inverse=False, **changes):
+    images, side = room(unit, count), 1.05 * SIDE * unit
+    if inverse:
+        images = dataclasses.replace(images, T_world_from_camera=np.linalg.inv(images.T_world_from_camera))
     grid = HashGridConfig(levels=4, features=4, log2_entries=13, finest=64)
     field = SceneFieldConfig((-side,) * 3, (side,) * 3, grid)
     config = TrainConfig(
@@ -92,6 +94,21 @@ def test_a_training_that_learns_nothing_says_so_once():
     _, _, told, _ = learned(1.0, near_m=4.0)  # nothing is nearer than the walls
     assert len(told) == 1
     assert "steps nothing is learned" in told[0]
+
+
+def test_poses_from_world_to_camera_are_told_by_what_was_held_out():
+    held_out = room(1.0, 104)
+    for inverse in (False, True):
+        _, _, told, renderer = learned(1.0, 100, inverse, steps=200)
+        assert told == [], "pictures are learned one by one"
+        poses = held_out.T_world_from_camera[100:]
+        poses = np.linalg.inv(poses) if inverse else poses
+        shown = renderer.render(poses, LENS)[0].numpy().reshape(held_out.rgb[100:].shape)
+        psnr_db = -10.0 * np.log10(((shown - held_out.rgb[100:] / 255.0) ** 2).mean())
+        problem = held_out_problem(psnr_db, held_out)
+        assert (problem is not None) is inverse, psnr_db
+    assert f"{psnr_db:.1f} dB, one colour for all gives {one_colour_db(held_out):.1f} dB" in problem
+    assert "from camera to world and not the inverse" in problem
 
 
 def test_what_one_colour_reaches_follows_from_the_spread_of_colours():
