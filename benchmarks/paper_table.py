@@ -136,7 +136,9 @@ def _excess(rows: list[dict[str, Any]], changed: str) -> Iterator[LedgerRow]:
 
 def _left(rows: list[dict[str, Any]], contrasts: list[dict[str, Any]]) -> Iterator[LedgerRow]:
     """The share of the excess of live drives with every assumption that is left without one of them, or any."""
-    compared = {each["after"]: each for each in contrasts if each["method"] == _METHOD}
+    compared = {
+        each["after"]: each for each in contrasts if (each["before"], each["method"]) == ("live", _METHOD)
+    }
     ideal = _row(rows, "live", _METHOD)
     for scenario in dict.fromkeys(each["scenario"] for each in rows if each["scenario"] != "live"):
         found = _row(rows, scenario, _METHOD)
@@ -146,8 +148,8 @@ def _left(rows: list[dict[str, Any]], contrasts: list[dict[str, Any]]) -> Iterat
             f"{found['excess_m']:.3f} of {ideal['excess_m']:.3f} m per tick; {found['searches']} searches, {found['off_track']} of {found['drives']} drives off the "
             f"track; mean |CTE| without attack {_row(rows, scenario, NONE)['excess_m']:.3f} m, {_row(rows, 'live', NONE)['excess_m']:.3f} m with all assumptions"
         )
-        same = compared[scenario]
-        if same["other_attacks"]:
+        same = compared.get(scenario)  # none if every search found another attack
+        if same and same["other_attacks"]:
             note += (
                 f"; {same['other_attacks']} of the searches were done again, and found other attacks: with the other {same['searches']} alone "
                 f"{100 * same['after_m'] / same['before_m']:.0f} %"

@@ -1,6 +1,7 @@
 """Rows of the paper's table against counts from the published cells."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -57,6 +58,22 @@ def test_the_tests_are_those_of_complete_sets(tmp_path):
     ]
     assert (row.value, row.unit, row.met) == (len(tests), f"of {len(tests)}", True)
     assert ledger_rows(tmp_path) == []
+
+
+def test_assumptions_are_told_also_where_no_attack_was_driven_with_and_without_them(tmp_path):
+    name = "imperfect_camera"
+    shutil.copytree(PUBLISHED / name, tmp_path / name)
+    file = tmp_path / name / "set" / "set.json"
+    data = json.loads(file.read_text())
+    before = {each.line: (each.value, each.note) for each in ledger_rows(tmp_path)}
+    assert len(before) == 2
+    assert all("with the other 1 alone" in note for _, note in before.values())
+    file.write_text(json.dumps({**data, "contrasts": []}))
+    after = {each.line: (each.value, each.note) for each in ledger_rows(tmp_path)}
+    assert {line: value for line, (value, _) in after.items()} == {
+        line: value for line, (value, _) in before.items()
+    }
+    assert all("alone" not in note for _, note in after.values())
 
 
 @pytest.mark.parametrize(

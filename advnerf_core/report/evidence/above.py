@@ -20,7 +20,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.about import ObjectPlace, read_about
-from advnerf_core.report.evidence.page import above_of, film_of, filmed_of, maps_of
+from advnerf_core.report.evidence.page import above_of, film_of, filmed_of, has_stills, maps_of
 from advnerf_core.report.evidence.results import Evidence, read_evidence
 from advnerf_core.report.evidence.rows import Key
 from advnerf_core.report.evidence.verifying.layout import SET
@@ -77,7 +77,7 @@ def write_above_of(folder: Path) -> Path | None:
     about = read_about(folder.parent).get(folder.name)
     film, target = folder.parent / film_of(folder.name), folder.parent / above_of(folder.name)
     evidence = read_evidence(folder)
-    if len(maps) > 1 or not data["primary"]:
+    if not has_stills(data):
         return write_maps(evidence, maps, target)
     place = about.object if about else None
     return write_above(evidence, data["primary"][-1], filmed_of(data), place, film, target)

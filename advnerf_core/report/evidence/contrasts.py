@@ -18,8 +18,8 @@ class ContrastRow:
     """One contrast of one method against one victim.
 
     Attributes:
-        before: Condition before.
-        after: Condition after.
+        before: Scenario with the first condition.
+        after: Scenario with the second one.
         before_m: Mean excess |CTE| per tick under the first condition [m].
         after_m: The same under the second, over the same searches and starts [m].
         difference_m: After minus before, paired by search and start [m].

@@ -167,16 +167,21 @@ def maps_of(data: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
     for claimed in data.get("claims", ()):
         for each in claimed["each"]:
             which = {"scenario": each["scenario"], "victim": each["victim"], "method": claimed["method"]}
-            test = {"placement": "", "against": [each["baseline"]], **which}
+            test = {"placement": "", **which}
             maps.setdefault(each["scenario"], []).append({**each, "test": test})
     return list(maps.values())
+
+
+def has_stills(data: Mapping[str, Any]) -> bool:
+    """Whether the picture of a set has one map beside stills of its film, instead of each of `maps_of`: its tests share their searches."""
+    return bool(data["primary"]) and len(maps_of(data)) == 1
 
 
 def _conditions(data: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """The conditions that contrasts compare, in the form of tests, each with the difference to the one before."""
     found = dict[str, Mapping[str, Any]]()
     for row in data.get("contrasts", ()):
-        of_row = {"placement": "", "victim": row["victim"], "method": row["method"], "against": []}
+        of_row = {"placement": "", "victim": row["victim"], "method": row["method"]}
         for end, difference_m in (("before", 0.0), ("after", row["difference_m"])):
             test = {"scenario": row[end], **of_row}
             found.setdefault(row[end], {"test": test, "baseline": None, "difference_m": difference_m})
@@ -197,10 +202,9 @@ def _filmed(data: Mapping[str, Any]) -> str:
 
 
 def _picture(name: str, data: Mapping[str, Any]) -> list[str]:
-    maps = maps_of(data)
-    if not maps:
+    if not maps_of(data):
         return []
-    if len(maps) > 1 or not data["primary"]:
+    if not has_stills(data):
         return [f"![All deployed drives of each scenario from above]({above_of(name)})\n"]
     shown, filmed = (place_of(each["test"]) for each in (data["primary"][-1], filmed_of(data)))
     stills = f" Stills: {filmed}." if data["filmed"] else ""
