@@ -14,6 +14,8 @@ GRADIENT, COARSE_GRADIENT = "gradient", "gradient_coarse"
 # Baselines whose texture has `cells` cells along an edge; all others have the object's.
 COARSE_BASELINES = ("random_coarse", *COARSE_SEARCHES)
 LEAST_FAMILIES = 3
+# Spaces by their names in experiments that ``random`` alone searches without a gradient: what it draws there are places or shapes, no textures.
+RANDOM_ALONE = ("places", "mesh_shape")
 
 
 def lacking_baselines(methods: Collection[str], other_cells: bool, families: Sequence[str]) -> list[str]:
@@ -59,8 +61,10 @@ def _note(registration: Registration, key: str) -> str:
     if not tests:
         return ""
     against = list(dict.fromkeys(method for test in tests for method in test.against))
-    ran = _methods(registration, key)
-    marks = list(_marks(against, ran, registration.scenarios[key]))
+    scenario = registration.scenarios[key]
+    if scenario.space.get("kind") in RANDOM_ALONE:
+        return "*Baseline*: random places or shapes, with as many evaluations as the attack; no other method searches these without a gradient."
+    marks = list(_marks(against, _methods(registration, key), scenario))
     verdict = f" **{'; '.join(marks)}.**" if marks else ""
     return f"*Baselines*: {', '.join(style_of(name).title for name in against)}, each with as many evaluations as the attack.{verdict}"
 

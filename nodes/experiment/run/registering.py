@@ -13,6 +13,7 @@ from advnerf_core.report.evidence.families import (
     COARSE_BASELINES,
     COARSE_GRADIENT,
     GRADIENT,
+    RANDOM_ALONE,
     RANDOM_FAMILIES,
     lacking_baselines,
 )
@@ -114,7 +115,7 @@ def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario
 def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[PrimaryTest]:
     """The tests on the main victim, per variant and path: the gradient against all baselines, and the coarse gradient against coarse ones.
 
-    Baselines are the methods whose textures neither trained nor judged the victim. A place without baselines has no test, and neither has one
+    Baselines are the methods whose textures neither trained nor judged the victim; of places and shapes it is ``random``. A place without baselines has no test, and neither has one
     of a claim over places: that samples places, not the searches at one of them.
 
     Raises:
@@ -126,7 +127,9 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
         found = [each for each in cells if each.scenario == scenario]
         config = experiment.of(found[0]).config
         victim = config.main_victim
-        methods = unseen((cell.method for cell in found if cell.victim == victim and cell.searched), config)
+        ran = dict.fromkeys(cell.method for cell in found if cell.victim == victim and cell.searched)
+        of_textures = config.space.kind not in RANDOM_ALONE
+        methods = unseen(ran, config) if of_textures else list(ran)
         against = [name for name in methods if name not in (GRADIENT, COARSE_GRADIENT)]
         if GRADIENT not in methods or not against:
             continue
@@ -137,7 +140,7 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
             )
         families = unseen(RANDOM_FAMILIES, config)
         lacking = lacking_baselines(methods, _coarse_cells_differ(config), families)
-        if lacking:
+        if of_textures and lacking:
             raise SetError(
                 f"{scenario}: expected the baselines that a test of the gradient needs, got {', '.join(against)} "
                 f"(textures of {', '.join(trained_on(config, victim))} train the victim, those of {', '.join(VALIDATED_ON)} judge it); add {'; '.join(lacking)} to "

@@ -42,6 +42,17 @@ def test_a_set_with_all_baselines_has_no_mark():
     assert "**baseline of other cells (random, coarse, cross-entropy) than the gradient's.**" in note
 
 
+def test_places_and_shapes_have_one_baseline_without_a_mark():
+    registration = read_registration(PUBLISHED / "room")
+    track = registration.scenarios["track"]
+    of_shapes = track.model_copy(update={"space": {"kind": "mesh_shape", "bound_m": 1.0}})
+    test = PrimaryTest(scenario="track", victim="hardened", method="gradient", against=("random",))
+    update = {"scenarios": {"track": of_shapes}, "primary": (test,)}
+    (note,) = families_note(registration.model_copy(update=update))
+    assert note.startswith("*Baseline*: random places or shapes")
+    assert "**" not in note
+
+
 def test_what_is_lacking_is_said_at_once():
     families = ("random_coarse", "random_levels", "random_pink")
     assert lacking_baselines((*families, "cem"), False, families) == []

@@ -11,6 +11,7 @@ from advnerf_core.report.evidence.families import coarse_cells_differ
 from advnerf_core.report.evidence.registration import FILE, PlaceClaim, SetError, read_registration
 from nodes.cli.main import app
 from nodes.experiment.engine.artefact import Settings, write_key
+from nodes.experiment.plan.space_config import MeshShapeConfig, PlacesConfig
 from nodes.experiment.run import plan
 from nodes.experiment.run.plan import plan_cells, registered_under
 from nodes.experiment.run.registering import primary_tests, register, registered_scenario
@@ -74,6 +75,16 @@ def test_a_test_needs_three_unseen_families_and_a_coarse_search(trained, tmp_pat
     with pytest.raises(SetError, match="baselines that a test of the gradient needs") as refused:
         primary_tests(made, made.cells)
     assert f"add {lacks} to the methods" in str(refused.value)
+
+
+@pytest.mark.parametrize("space", [PlacesConfig(kind="places"), MeshShapeConfig(kind="mesh_shape")])
+def test_places_and_shapes_are_tested_against_random_ones(trained, tmp_path, space):
+    """White noise has trained the victim, but ``random`` draws places or shapes here."""
+    made = made_of(trained, tmp_path, ("random", "gradient"), space=space)
+    tests = primary_tests(made, made.cells)
+    assert {(test.method, test.against) for test in tests} == {("gradient", ("random",))}
+    of_colours = made_of(trained, tmp_path / "colours", ("random", "gradient"))
+    assert primary_tests(of_colours, of_colours.cells) == []
 
 
 def test_tests_of_deployed_drives_need_deployed_drives(trained, tmp_path):
