@@ -18,7 +18,6 @@ from advnerf_core.report.reference import Domain
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 SHOWN_VIEWS = 6  # held-out views whose images a page shows
-_TICKS_COMPARED = (50, 400)  # horizons whose memory use is compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +238,6 @@ class ReportData:
         overview: The world from above; None if it has no such picture.
         done: What was searched and driven, in one paragraph.
         live: Whether the drives were live; the following fields are then shown, or named as missing.
-        memory_mib: Peak memory above idle of one adjoint gradient, by its horizon in ticks [MiB].
         not_measured: Reason for a missing part, by its name.
     """
 
@@ -251,7 +249,6 @@ class ReportData:
     done: str = ""
     live: bool = False
     latency: Latency | None = None
-    memory_mib: Mapping[int, float] = field(default_factory=dict)
     laps: Laps | None = None
     not_measured: Mapping[str, str] = field(default_factory=dict)
 
@@ -270,5 +267,4 @@ class ReportData:
                 "latency_p99_ms": self.latency.p99_ms,
                 "missed_ticks": self.latency.missed_ticks,
             }
-        short, long = (self.memory_mib.get(ticks) for ticks in _TICKS_COMPARED)
-        return {**found, "memory_ratio": long / short} if short and long else found
+        return found

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -161,17 +161,6 @@ def latency_histogram(latency: Latency) -> Figure:
         ):
             ax.text(at, 1.01, text, transform=ax.get_xaxis_transform(), ha=ha, size=8.5, color=LIGHT[colour])
         ax.set(xlabel="capture to serial write [ms]", ylabel="frames", xlim=(0.0, end))
-    return ax.figure
-
-
-def memory_against_horizon(memory_mib: Mapping[int, float]) -> Figure:
-    """Peak memory of the adjoint above idle against the horizon."""
-    with new_axes(6.0, 3.0) as ax:
-        horizons, peaks = zip(*sorted(memory_mib.items()), strict=True)
-        ax.plot(horizons, peaks, "-o", ms=5, color=LIGHT["gradient"])
-        ax.set(xlabel="horizon T [control ticks]", ylabel="peak above idle [MiB]")
-        ax.set_xlim(left=0.0)
-        ax.set_ylim(bottom=0.0)
     return ax.figure
 
 

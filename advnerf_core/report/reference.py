@@ -21,7 +21,6 @@ LiveMeasure = Literal[
     "psnr_full_db",
     "psnr_policy_db",
     "steering_difference_rad",
-    "memory_ratio",
 ]
 
 
@@ -30,8 +29,7 @@ class Limit(StrictModel):
 
     Attributes:
         of: The measure. ``excess_m`` is the excess |CTE| per tick over the plain object, ``ratio`` the total CTE over that past the plain
-            object (publications in other units give this), ``mean_abs_cte_m`` per tick, ``memory_ratio`` the peak memory of the adjoint
-            over 400 ticks against that over 50.
+            object (publications in other units give this), ``mean_abs_cte_m`` per tick.
         what: Title of the measure; empty to derive it from the keys.
         scenario: Scenario of the drives; empty for the first one.
         victim: Victim of the drives.

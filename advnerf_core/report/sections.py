@@ -1,4 +1,4 @@
-"""Sections of an experiment's page: maps, films, textures, fidelity, and for live drives their timing and memory."""
+"""Sections of an experiment's page: maps, films, textures, fidelity, and for live drives their timing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ def page_sections(data: ReportData, table: ResultTable) -> list[tuple[str, Marku
     parts += [("views", "Learned and real pictures")] if data.fidelity else []
     if data.live:
         parts += [("laps", "Laps without attack"), ("timing", "Live timing")]
-        parts.append(("memory", "Memory against the horizon"))
     parts.append(("manifest", HOW))
 
     def made(*wanted: tuple[str, str]) -> list[tuple[str, Markup]]:
@@ -45,7 +44,6 @@ def _fragments(data: ReportData, table: ResultTable) -> Any:
         image=lambda picture: image_uri(picture, quality=88),
         hops=_hop_table(data).html(),
         live_tries=_tries_table(table),
-        memory_rows=_memory_table(data).html(),
         timings=_timing_table(data).html(),
         figures=_figures(data),
         textures=[(t, image_uri(t.image)) for t in data.textures],
@@ -84,8 +82,6 @@ def _figures(data: ReportData) -> dict[str, Any]:
         made["steering"] = plots.steering_agreement(data.fidelity), "Control on learned against real images"
     if data.latency is not None:
         made["latency"] = plots.latency_histogram(data.latency), "Histogram of capture-to-serial latency"
-    if data.memory_mib:
-        made["memory"] = plots.memory_against_horizon(data.memory_mib), "Peak memory against the horizon"
     return {name: plots.svg(*each) for name, each in made.items()}
 
 
@@ -155,12 +151,6 @@ def _tries_table(table: ResultTable) -> Table:
         cells.append((*named, driven, str(len(spoiled)), "; ".join(spoiled)))
     columns = ("object shows", "policy", "seed", "driven live", "spoiled tries", "why they do not count")
     return Table("Live drives", columns, tuple(cells), (False, False, True, False, True, False))
-
-
-def _memory_table(data: ReportData) -> Table:
-    """Peak memory against the horizon."""
-    cells = tuple((str(ticks), number(mib, 1)) for ticks, mib in data.memory_mib.items())
-    return Table("Peak memory above idle", ("T", "adjoint [MiB]"), cells, (True, True))
 
 
 def _timing_table(data: ReportData) -> Table:

@@ -60,7 +60,6 @@ _MEASURES: Mapping[str, _Measure] = {
     "psnr_full_db": _Measure("PSNR of the camera's image", 1, " dB"),
     "psnr_policy_db": _Measure("PSNR of the policy's image", 1, " dB"),
     "steering_difference_rad": _Measure("steering difference", 4, " rad"),
-    "memory_ratio": _Measure("peak memory", 2, " ×"),
 }
 
 

@@ -20,7 +20,6 @@ from nodes.experiment.engine.artefact import read_artefact
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face, panel_of, wanted_face
-from nodes.experiment.show.given import victim_without_gradient
 from nodes.experiment.show.learned_scene import FIDELITY, view_pictures
 from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment.steps.deploy import DRIVES
@@ -41,7 +40,6 @@ def gather(
     seen: Mapping[str, Mapping[str, NDArray[np.uint8]]],
     done: str,
     overview: NDArray[np.uint8] | None,
-    memory_mib: Mapping[int, float],
 ) -> rd.ReportData:
     """All data of the page of an experiment with all earlier stages and cells finished.
 
@@ -49,7 +47,6 @@ def gather(
         films: Films by scenario.
         seen: Camera images of the objects, by scenario and method.
         done: Summary of the searches and drives, in one paragraph.
-        memory_mib: Memory of the adjoint by horizon, if it was measured [MiB].
     """
     live = experiment.config.deploy.live
     return rd.ReportData(
@@ -63,7 +60,6 @@ def gather(
         fidelity=None if experiment.given_scene is not None else _fidelity(experiment),
         done=done,
         live=live,
-        memory_mib=memory_mib,
         **(_live_parts(experiment) if live else {}),
     )
 
@@ -163,8 +159,6 @@ def _not_measured(
         )
     if not measured:
         found["latency"] = "no live drive counts"
-    if victim_without_gradient(experiment):
-        found["memory"] = "the victim has no gradient"
     return found
 
 

@@ -36,7 +36,7 @@ from nodes.experiment.plan.object_kinds import name_of
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.overview import from_above
 from nodes.experiment.show.spaces import make_space
-from nodes.experiment.steps import films, memory
+from nodes.experiment.steps import films
 from nodes.experiment.steps.attack import dress_cell, load_shown, planned_evaluations
 from nodes.experiment.steps.keys import driven_folder
 from nodes.runtime.progress import Report
@@ -67,23 +67,20 @@ def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[st
 
 
 def _measure(experiment: Experiment, folder: Path, report: Report) -> ReportData:
-    """Cut films, and render the objects if the deployed world can be opened; for live drives measure memory."""
+    """Cut films, and render the objects if the deployed world can be opened."""
     config, names = experiment.config, experiment.config.cell_paths
-    memory_mib: dict[int, float] = {}
-    if config.deploy.live:
-        memory_mib = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
     filmed, seen, above = {}, {}, None
     with experiment.open_deployed_world() if config.deploy.through == "world" else nullcontext() as scene:
         space = make_space(experiment, scene)
         for index, name in enumerate(names):
-            report(0.6 + 0.3 * index / len(names), f"filming {name}")
+            report(0.9 * index / len(names), f"filming {name}")
             filmed[name] = films.film_scenario(experiment, scene, space, name, folder)
             if scene is not None:
                 seen[name] = textures_seen(experiment, scene, space, name)
             elif not config.deploy.live:
                 seen[name] = seen_where_learned(experiment, space, name)
         above = None if scene is None else from_above(experiment, scene)
-    return gather(experiment, filmed, seen, how_it_was_run(experiment), above, memory_mib)
+    return gather(experiment, filmed, seen, how_it_was_run(experiment), above)
 
 
 def wording_of(experiment: Experiment) -> Wording:

@@ -90,9 +90,3 @@ def victim_sha256(experiment: RunFolder, victim: str) -> str:
     if victim in given_in(experiment.config):
         return given_victim(experiment, victim).sha256
     return policy_sha256(victim_spec(experiment, victim))
-
-
-def victim_without_gradient(experiment: RunFolder) -> bool:
-    """Whether the main victim declares that it has no gradient."""
-    main = experiment.config.main_victim
-    return main in given_in(experiment.config) and not given_victim(experiment, main).declared.differentiable

@@ -257,7 +257,6 @@ def full_report(folder: Path, steps=60):
         fidelity=fidelity(),
         live=True,
         latency=latency(),
-        memory_mib={t: 180 + 0.01 * t for t in (50, 100, 200, 400)},
         laps=laps(),
     )
 

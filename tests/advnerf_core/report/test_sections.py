@@ -79,7 +79,6 @@ def test_the_page_is_whole_and_loads_nothing(report):
         "learned-and-real-pictures",
         "laps-without-attack",
         "live-timing",
-        "memory-against-the-horizon",
         "how-it-was-run",
     ]
     assert checker.links == ["#how-it-was-run", *(f"#{each}" for each in checker.ids)]
@@ -89,8 +88,8 @@ def test_the_page_is_whole_and_loads_nothing(report):
 def test_missing_parts_are_named(bare_report):
     page = page_of(bare_report)
     check(page)
-    # drives, fidelity, laps, latency, memory
-    assert page.count("Not measured in this run.") == 5
+    # drives, fidelity, laps, latency
+    assert page.count("Not measured in this run.") == 4
     assert "No &lt;live&gt; drive." in page
 
 

@@ -70,13 +70,6 @@ def test_latency(bare_report, samples, missed, fast, none_missed):
     assert found["control ticks missed, live"] is none_missed
 
 
-def test_memory_needs_both_horizons(bare_report):
-    name = "adjoint, peak memory above idle, T = 400 against T = 50"
-    assert verdicts(replace(bare_report, memory_mib={50: 100.0, 200: 90.0}))[name] is None
-    assert verdicts(replace(bare_report, memory_mib={50: 100.0, 400: 110.0}))[name] is True
-    assert verdicts(replace(bare_report, memory_mib={50: 100.0, 400: 111.0}))[name] is False
-
-
 def test_fidelity_and_laps(bare_report):
     views = (
         FidelityView("a", 26.0, 30.0, 0.9, 0.9, 0.1, 0.139),

@@ -21,6 +21,7 @@ from calibration.display_colour import DisplayCalibration
 from calibration.schema import save_calibration
 from nodes.cli import main as cli
 from nodes.experiment.node.check import check
+from nodes.experiment.node.memory import measured_mib
 from nodes.experiment.node.prepare import load_request, prepare, request_text
 from nodes.experiment.node.search import attack_file, run_attack
 from nodes.experiment.steps.keys import NoSuchCellError
@@ -290,6 +291,12 @@ def test_every_result_stands_beside_the_drive_without_attack(tmp_path, monkeypat
     assert f"drive without attack: total CTE {clean.mean_total_cte_m:.2f} m over 3 ticks" in checked
     assert "NO DRIVE" in checked
     assert json.loads((tmp_path / "out" / "check.json").read_text())["clean"] == clean.to_dict()
+
+
+def test_the_memory_of_a_gradient_is_that_of_one_start_in_another_process(tmp_path):
+    ((ticks, mib),) = measured_mib(loaded(tiny_request(tmp_path), ["attack.starts=3"]), [2])
+    assert ticks == 2
+    assert 0.0 <= mib < 200.0
 
 
 def test_a_policy_that_drives_gets_no_warning(tmp_path, monkeypatch, capsys):

@@ -31,7 +31,6 @@ from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.keys import driven_folder
-from nodes.experiment.steps.memory import in_a_child
 from nodes.experiment.steps.run import load_experiment
 from tests.support import shut_world
 
@@ -176,15 +175,6 @@ def test_a_module_has_a_gradient_and_finished_cells_are_not_run_again(folder: Pa
     assert [end.name for end in ended] == ["track_module_gradient_0"]
     found = statuses(loaded(folder), loaded(folder).cells)
     assert {each.state for each in found} == {"done"}
-
-
-def test_the_memory_of_a_gradient_is_measured_in_another_process(folder: Path) -> None:
-    """Which knows the experiment from its run folder alone, as the report of live drives has it."""
-    experiment = loaded(folder, *ONLY_THE_MODULE)
-    run_experiment(experiment, until="bake")
-    ((ticks, mib),) = in_a_child("nodes.experiment.steps.memory", experiment.folder, [2])
-    assert ticks == 2
-    assert 0.0 <= mib < 200.0
 
 
 def test_a_factory_is_found_beside_the_experiment_file(folder: Path, tmp_path: Path) -> None:
