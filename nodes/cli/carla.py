@@ -1,9 +1,9 @@
-"""The commands ``advnerf scene carla ...``: look at a server, list junctions, photograph one, drive it, free a server."""
+"""The commands ``advnerf scene carla ...``: look at a server, list junctions, free a server. Experiments photograph and drive them."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -84,75 +84,6 @@ def carla_junctions(
         place = f"{junction.x_m:.1f}", f"{junction.y_m:.1f}"
         rows.add_row(str(junction.id), *place, str(junction.arms), str(junction.drives))
     print_table(rows)
-
-
-@app.command("capture")
-def carla_capture(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder of the pictures; a stopped capture goes on there.")
-    ],
-    host: Host = None,
-    port: Port = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    photos: Annotated[int, typer.Option(min=1, help="Photographs to learn from.")] = 1800,
-    held_out: Annotated[int, typer.Option(min=0, help="Views that nothing learns from.")] = 60,
-    seed: Annotated[int, typer.Option(help="Random seed of the views.")] = 0,
-) -> None:
-    """Photograph a junction along its lanes: transforms.json for `advnerf scene train --open`, and the reference paths."""
-    from nodes.lab.carla.capture import CaptureRequest, capture
-    from nodes.runtime.progress import ProgressDisplay
-
-    request = CaptureRequest(photos, held_out, seed)
-    with ends_in_order(), ProgressDisplay() as display:
-        taken, there = capture(
-            _config(config, overrides, host, port), request, output, display.start("capture")
-        )
-    print(f"{taken} pictures taken, {there} were there: {output}")
-
-
-@app.command("drive")
-def carla_drive(
-    host: Host = None,
-    port: Port = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    path: Annotated[
-        Literal["straight", "right", "left"], typer.Option(help="Reference path of the junction.")
-    ] = "straight",
-    seconds: Annotated[float, typer.Option(min=0.1, help="How long to drive.")] = 6.0,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="JSON file for states, turn rates and cross-track errors."),
-    ] = None,
-) -> None:
-    """Let the expert, who knows the true state, follow a reference path; says how well it did."""
-    import json
-
-    from advnerf_core.files import write_atomically
-    from hardware.worlds.carla.scene import CarlaScene
-    from nodes.lab.worlds.expert_drive import as_path, drive_expert, lane_expert
-
-    wanted = _config(config, overrides, host, port)
-    dt_s = wanted.render.fixed_delta_s
-    with ends_in_order(), CarlaScene(wanted) as scene:
-        reference = scene.paths[path]
-        expert = lane_expert(as_path(reference), wanted.car.description, dt_s)
-        drive = drive_expert(scene, expert, reference.start_pose, max(round(seconds / dt_s), 1), dt_s)
-    worst, mean = abs(drive.cte_m).max(), abs(drive.cte_m).mean()
-    print(
-        f"{path}: |CTE| {mean:.3f} m on average, {worst:.3f} m at worst, over {len(drive.controls)} ticks of {dt_s:g} s"
-    )
-    if drive.blocked_tick is not None:
-        print(f"the car ran into something, or left the scene, at tick {drive.blocked_tick}")
-    if output is not None:
-        arrays = {"states": drive.states, "controls": drive.controls, "cte_m": drive.cte_m}
-        content = {
-            "path": path,
-            "blocked_tick": drive.blocked_tick,
-            **{name: rows.tolist() for name, rows in arrays.items()},
-        }
-        write_atomically(output, json.dumps(content) + "\n")
 
 
 @app.command("release")

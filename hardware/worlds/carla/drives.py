@@ -1,4 +1,4 @@
-"""The drives through a junction of a CARLA map, and the same as plain data."""
+"""The drives through a junction of a CARLA map."""
 
 from __future__ import annotations
 
@@ -43,8 +43,3 @@ class JunctionDrives:
             "height_range_m": self.height_range_m,
             "right_hand": self.right_hand,
         }
-
-    def to_dict(self) -> dict[str, Any]:
-        """The drives as plain data (JSON types)."""
-        paths = {name: path.to_dict() for name, path in self.paths.items()}
-        return {**self.place, "paths": paths, "lane_width_m": self.lane_width_m}

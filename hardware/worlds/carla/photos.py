@@ -45,21 +45,6 @@ def photo_poses(
     return poses
 
 
-def held_out_states(
-    drives: JunctionDrives, count: int, rng: np.random.Generator
-) -> list[tuple[float, float, float]]:
-    """Poses of the car (x [m], y [m], yaw [rad]) around the drives, whose views are held out from learning."""
-    paths, states = list(drives.paths.values()), []
-    for index in range(count):
-        path = paths[index % len(paths)]
-        x, y, yaw = path.pose_at(float(rng.uniform(0.0, min(36.0, path.length_m))))
-        aside = float(rng.uniform(-0.3, 0.3)) * drives.lane_width_m
-        states.append(
-            (x - aside * math.sin(yaw), y + aside * math.cos(yaw), yaw + float(rng.uniform(-0.2, 0.2)))
-        )
-    return states
-
-
 def _held(camera: CameraConfig, rng: np.random.Generator) -> Array:
     height = camera.z_m + float(rng.uniform(-0.2, 0.4))
     pitch = camera.pitch_down_rad + float(rng.normal(0.0, math.radians(3.0)))
