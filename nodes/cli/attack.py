@@ -163,3 +163,32 @@ def attack_check(
         print(line)
     print(f"written: {', '.join(map(str, write_check(found, request.folder)))}")
     fail_unless(found.sound)
+
+
+@app.command("maps")
+def attack_maps(
+    file: RequestFile,
+    output: Output = None,
+    attack: Annotated[
+        Path | None,
+        typer.Option(
+            "--attack",
+            help="An attack file that gives poses and colours; without it, those of the request.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Draw the loss landscape and the robustness map (starts x moves of an object) of a request with space.kind places; resumes after a kill."""
+    from nodes.experiment.node.poses import mapped
+    from nodes.experiment.node.prepare import load_request
+    from nodes.runtime.locks import hold_folder
+    from nodes.runtime.progress import ProgressDisplay
+
+    request = load_request(file, overrides or [], output)
+    folder, maps = request.folder, request.config.maps
+    with hold_folder(folder), ProgressDisplay() as display:
+        pictures = mapped(request, attack).draw(maps, maps.object, folder, display.start("maps"))
+    for picture in pictures:
+        print(picture)

@@ -20,10 +20,8 @@ _RESUMABLE = (
     ("experiment", "maps"),
     ("attack", "run"),
     ("attack", "resume"),
-    ("attack", "landscape"),
-    ("attack", "robustness"),
+    ("attack", "maps"),
     ("scene", "train"),
-    ("scene", "carla", "capture"),
     ("policy", "train"),
     ("car", "trial"),
 )

@@ -19,7 +19,6 @@ from advnerf_core.places import use_writable_cache
 from nodes.cli import arm as cli_arm
 from nodes.cli import attack as cli_attack
 from nodes.cli import attack_node as cli_attack_node
-from nodes.cli import attack_poses as cli_attack_poses
 from nodes.cli import attack_print as cli_attack_print
 from nodes.cli import audit as cli_audit
 from nodes.cli import bag as cli_bag
@@ -75,8 +74,6 @@ cli_policy.app.add_typer(cli_log.app, name="log")
 app.add_typer(cli_policy.app, name="policy")
 cli_attack.app.command("request")(cli_attack_node.attack_request)
 cli_attack.app.command("cancel")(cli_attack_node.attack_cancel)
-cli_attack.app.command("landscape")(cli_attack_poses.attack_landscape)
-cli_attack.app.command("robustness")(cli_attack_poses.attack_robustness)
 cli_attack.app.command("print")(cli_attack_print.attack_print)
 cli_attack.app.command("measure")(cli_attack_print.attack_measure)
 cli_attack.app.add_typer(cli_method.app, name="method")

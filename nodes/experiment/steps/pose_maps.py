@@ -11,9 +11,7 @@ from torch import Tensor
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.pose_maps import (
-    Landscape,
     PoseMapError,
-    RobustnessMap,
     landscape,
     places_over,
     robustness_map,
@@ -24,7 +22,7 @@ from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search.poses import placed_sensor
 from advnerf_core.files import write_atomically
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.plan.maps_config import LandscapeConfig, RobustnessMapConfig
+from nodes.experiment.plan.maps_config import LandscapeConfig, MapsConfig, RobustnessMapConfig
 from nodes.experiment.plan.space_config import PlacesConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
@@ -50,14 +48,27 @@ class Mapped:
     digest: str
     mark: str = ""
 
-    def landscape(
-        self, wanted: LandscapeConfig, number: int, file: Path, report: Report
-    ) -> tuple[Landscape, Path]:
-        """Drive over a grid of one object's places; finished points are kept in a JSON file, and the picture goes beside it.
+    def draw(self, maps: MapsConfig, number: int, folder: Path, report: Report, name: str = "") -> list[Path]:
+        """Drive over a grid of one object's places, and from starts beside the first one past the object moved.
+
+        Args:
+            number: Number of the moved object.
+            folder: For ``landscape.json``, ``robustness.json``, which keep finished points, and a PNG of each.
+            name: Ending of their names.
+
+        Returns:
+            The pictures.
 
         Raises:
-            PoseMapError: The object does not exist, or the file holds another map.
+            PoseMapError: The object does not exist, or a file holds another map.
         """
+        flat, rough = folder / f"landscape{name}.json", folder / f"robustness{name}.json"
+        return [
+            self._landscape(maps.landscape, number, flat, _half(report, 0.0, "landscape")),
+            self._robustness(maps.robustness, number, rough, _half(report, 0.5, "starts x moves")),
+        ]
+
+    def _landscape(self, wanted: LandscapeConfig, number: int, file: Path, report: Report) -> Path:
         sensor = placed_sensor(self.problem)
         places = sensor.placements(self.theta)
         if number >= len(places):
@@ -69,12 +80,9 @@ class Mapped:
         marked = {self.mark: (float(place[0]), float(place[1]))} if self.mark else None
         picture = file.with_suffix(".png")
         write_atomically(picture, draw_landscape(found, [self.problem.path], marked))
-        return found, picture
+        return picture
 
-    def robustness(
-        self, wanted: RobustnessMapConfig, number: int, file: Path, report: Report
-    ) -> tuple[RobustnessMap, Path]:
-        """Drive from starts beside the first one past the object moved; see `landscape`."""
+    def _robustness(self, wanted: RobustnessMapConfig, number: int, file: Path, report: Report) -> Path:
         starts = starts_beside(self.problem.start_states[0, :3].tolist(), wanted.sideways_m, wanted.turn_rad)
         moves = [(dx, dy, turn) for turn in wanted.object_turns_rad for dx, dy in wanted.object_moves_m]
         found = robustness_map(
@@ -82,7 +90,7 @@ class Mapped:
         )
         picture = file.with_suffix(".png")
         write_atomically(picture, draw_robustness(found))
-        return found, picture
+        return picture
 
 
 def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, report: Report) -> list[Path]:
@@ -90,7 +98,7 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
 
     Args:
         number: Number of the moved object.
-        folder: Folder of the cell, for ``landscape_<name>.json``, ``robustness_<name>.json`` and a PNG of each; it also stores finished points.
+        folder: Folder of the cell; see `Mapped.draw`.
 
     Returns:
         The pictures; none for a cell that moved no object.
@@ -110,12 +118,7 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
     places = torch.tensor([each.placement for each in attack.objects], dtype=torch.float64)
     # In the unit box even if only the plain colours are used.
     theta = sensor.join(sensor.space.unit(places), space.restored(attack).colours)
-    about = Mapped(problem, theta, attack.sha256, "found")
-    flat, rough = folder / f"landscape_{name}.json", folder / f"robustness_{name}.json"
-    return [
-        about.landscape(maps.landscape, number, flat, _half(report, 0.0, "landscape"))[1],
-        about.robustness(maps.robustness, number, rough, _half(report, 0.5, "starts x moves"))[1],
-    ]
+    return Mapped(problem, theta, attack.sha256, "found").draw(maps, number, folder, report, f"_{name}")
 
 
 def _telling(report: Report) -> Callable[[int, int], None]:

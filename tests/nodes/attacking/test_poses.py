@@ -57,8 +57,8 @@ def test_commands_search_map_and_find_their_work_again(tmp_path, monkeypatch, ca
     assert curve["attack_id"] == attack.attack_id
     np.testing.assert_allclose(curve["placements"], [placement])
     assert (folder / "seed_0.poses.png").stat().st_size > 1000
+    assert command(monkeypatch, "maps", file, "-o", folder, "--attack", attack_path) == 0
     for name in ("landscape", "robustness"):
-        assert command(monkeypatch, name, file, "-o", folder, "--attack", attack_path) == 0
         assert (folder / f"{name}.png").stat().st_size > 1000
     assert len(json.loads((folder / "landscape.json").read_text())["cells"]) == 4
     assert np.array(json.loads((folder / "robustness.json").read_text())["cells"]["1"]).shape == (3, 2)
@@ -66,9 +66,9 @@ def test_commands_search_map_and_find_their_work_again(tmp_path, monkeypatch, ca
     assert attack_path.read_bytes() == content
     capsys.readouterr()
     # Another question in the same folder is refused in one line.
-    assert command(monkeypatch, "landscape", file, "-o", folder) == 2
+    assert command(monkeypatch, "maps", file, "-o", folder) == 2
     assert "belongs to a map with other settings" in capsys.readouterr().err
-    assert command(monkeypatch, "landscape", file, "-o", tmp_path / "b", "--set", "maps.object=3") == 2
+    assert command(monkeypatch, "maps", file, "-o", tmp_path / "b", "--set", "maps.object=3") == 2
     assert "expected an object of 0" in capsys.readouterr().err
 
 
