@@ -4,24 +4,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.report.evidence.verifying.numbers import same
-from benchmarks import gap, paper_table, predictions, retraining, transfer_correlation, transfer_table
+from benchmarks import gap, paper_table, predictions, retraining, transfer_correlation
 from benchmarks.kept_commands import kept_by
 from benchmarks.results import REPOSITORY, LedgerRow
 from nodes.experiment.steps.run import load_experiment
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 _COMPARED = ("value", "unit", "target", "met", "note")
-
-
-def table_rows(file: str) -> list[LedgerRow]:
-    """Rows of an experiment's table, targets and gate."""
-    found = transfer_table.ledger_rows(REPOSITORY / file, PUBLISHED / Path(file).name.split(".")[0])
-    return [row.with_command(row.command.replace(str(REPOSITORY / file), file)) for row in found]
 
 
 def retraining_rows(file: str, setting: str, folder: str) -> list[LedgerRow]:
@@ -37,7 +30,6 @@ def retraining_rows(file: str, setting: str, folder: str) -> list[LedgerRow]:
 
 
 _AGAIN: dict[str, Callable[..., list[LedgerRow]]] = {
-    "table": table_rows,
     "retraining": retraining_rows,
     "gap": gap.ledger_rows,
     "predictions": predictions.ledger_rows,

@@ -18,8 +18,6 @@ from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.fidelity import reasons_against
 from advnerf_core.scene.gate_limits import GateLimits
-from benchmarks.first_build import PAGE as FIRST_BUILD
-from benchmarks.first_build import page_text
 from benchmarks.kept_rows import computed_again, counts, row_problems
 from benchmarks.page_numbers import count_numbers
 from benchmarks.results import PAGE, REPOSITORY, read_rows, write_pages
@@ -36,7 +34,12 @@ def main() -> None:
     rows = read_rows()
     kept, numbers = counts(rows), count_numbers(REPOSITORY / "docs", rows)
     again = computed_again([row["command"] for row in rows])
-    problems = [*row_problems(rows, again), *target_problems(rows), *gate_problems(), *page_problems(rows)]
+    problems = [
+        *row_problems(rows, again),
+        *target_problems(rows),
+        *gate_problems(),
+        *row_page_problems(rows, PAGE),
+    ]
     found = {"rows": kept[True], "not_kept": kept[False], "numbers": vars(numbers)}
     print(json.dumps({**found, "problems": [*problems, *numbers.problems]}))
 
@@ -54,13 +57,6 @@ def target_problems(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             yield f"{row['line']!r}: says that {value:g} met {row['target']}"
         elif alone and holds and not row["met"]:
             yield f"{row['line']!r}: says that {value:g} missed {row['target']}"
-
-
-def page_problems(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Pages that are not those of the rows and of the first build's cells."""
-    yield from row_page_problems(rows, PAGE)
-    if FIRST_BUILD.read_text("utf-8") != page_text():
-        yield f"{FIRST_BUILD}: is not the page of its cells; python -m benchmarks.first_build writes it"
 
 
 def row_page_problems(rows: list[dict[str, Any]], page: Path) -> Iterator[str]:

@@ -16,7 +16,6 @@ class Question:
         answers: What it is about, in a sentence.
         commands: Benchmarks and campaigns, by their names, and other commands, by their beginning, that measure its rows.
         picture: What stands first on the page, relative to it; empty for nothing.
-        lost: Whether its rows are of the earlier build, whose victims are lost.
     """
 
     slug: str
@@ -24,14 +23,7 @@ class Question:
     answers: str
     commands: tuple[str, ...]
     picture: str = ""
-    lost: bool = False
 
-
-# At the head of each page of the earlier build.
-LOST = (
-    "**Results of an earlier build.** The weights of its victims were lost, so these drives cannot be repeated. The page goes when its "
-    "successor is there. Registered results are in [Does it transfer?](transfer.md)."
-)
 
 QUESTIONS = (
     Question(
@@ -102,18 +94,10 @@ QUESTIONS = (
         ("hardening",),
     ),
     Question(
-        "places_and_meshes",
-        "Do places, mesh textures and mesh shapes work as attacks?",
-        "The same transfer experiment over other spaces of search.",
-        ("advnerf experiment launch/poses", "advnerf experiment launch/meshes"),
-        lost=True,
-    ),
-    Question(
         "retraining",
         "Does retraining on attacks help?",
         "Policies trained again on the attacks that were found against them.",
-        ("advnerf experiment launch/",),
-        lost=True,
+        ("advnerf experiment run launch/junction",),
     ),
     Question(
         "stopping",

@@ -14,7 +14,7 @@ import platform
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.evidence.registration import launch_file
 from benchmarks.answers import Answer, answers, sets_table, table
 from benchmarks.kept_commands import NOT_KEPT, kept_by
-from benchmarks.questions import LOST, OTHER, QUESTIONS, Question, question_of
+from benchmarks.questions import OTHER, QUESTIONS, Question, question_of
 from nodes.runtime.machine import memory_gib, processor_name
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -67,10 +67,6 @@ class LedgerRow:
     note: str = ""
     machine: str = ""
     date: str = ""
-
-    def with_command(self, command: str) -> LedgerRow:
-        """The same row of another command."""
-        return replace(self, command=command)
 
     def record(self, ledger: Path = LEDGER, page: Path = PAGE) -> None:
         """Write it into a ledger."""
@@ -172,7 +168,7 @@ def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answ
         "| question | rows | with a target | missed |\n|---|---|---|---|\n"
     )
     lines = [
-        f"| [{question.title}](results/{question.slug}.md){' (earlier build)' if question.lost else ''} | {len(found)} "
+        f"| [{question.title}](results/{question.slug}.md) | {len(found)} "
         f"| {sum(row['met'] is not None for row in found)} | {sum(row['met'] is False for row in found)} |\n"
         for question, found in answered.items()
     ]
@@ -195,7 +191,7 @@ def _missed_page(answered: dict[Question, list[dict[str, Any]]]) -> str:
 
 def _question_page(question: Question, rows: list[dict[str, Any]]) -> str:
     """A page with one table for each command, in the order of the rows."""
-    text = f"# {question.title}\n\n" + (f"{LOST}\n\n" if question.lost else "")
+    text = f"# {question.title}\n\n"
     text += f"![{question.title}]({question.picture})\n\n" if question.picture else ""
     text += f"{question.answers} [All questions](../results.md).\n"
     for command in dict.fromkeys(row["command"] for row in rows):

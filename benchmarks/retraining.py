@@ -1,6 +1,6 @@
 """Question: does retraining on found attacks cure the policy, and for how long? ``python -m benchmarks.retraining RUN_FOLDER``.
 
-Reads what ``advnerf experiment launch/junction.experiment.yaml --setting retrain`` wrote; computes nothing anew.
+Reads what ``advnerf experiment run launch/junction.experiment.yaml --setting retrain`` wrote; computes nothing anew.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.results import REPOSITORY, record_row
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import victim_spec
 from nodes.experiment.steps import retrain_plot
 from nodes.experiment.steps.run import load_experiment
 
@@ -29,23 +30,22 @@ def rows_of(summary: dict[str, Any], allowed: int) -> list[tuple[str, float, str
             f"one seed, one start that nothing has seen, deployed: original undisturbed {drive['original_undisturbed_m']:.2f} m, attacked "
             f"{drive['original_attacked_m']:.2f} m; retrained undisturbed {drive['retrained_undisturbed_m']:.2f} m, attacked {drive['retrained_attacked_m']:.2f} m"
         )
-        line = f"retrained under the old attack, {name}, over the original undisturbed"
+        line = f"retrained once, under the old attack, {name}, over the original undisturbed"
         rows.append((line, drive["ratio"], "x", f"<= {_TARGET} x", drive["ratio"] <= _TARGET, note))
     for number, each in enumerate(summary["rounds"]):
         for name in each["surrogate"]:
-            line = f"attack -> retrain -> attack, round {number}, {name}, deployed"
-            note = f"in the learned scene {each['surrogate'][name]:.2f} x; victim {each['victim'][:12]}, gradient, one seed"
-            if (
-                number == len(summary["rounds"]) - 1
-                and max(each["surrogate"].values()) >= summary["pays_ratio"]
-            ):
+            line = f"attack on the policy after {number} round{'s' * (number != 1)} of retraining, {name}, deployed"
+            note = f"in the learned scene {each['surrogate'][name]:.3f} m; victim {each['victim'][:12]}, gradient, one seed"
+            if number == len(summary["rounds"]) - 1 and max(each["surrogate"].values()) > summary["pays_m"]:
                 ended = (
                     "the number of rounds ended the loop"
                     if number >= allowed
                     else f"the loop was stopped before its {allowed} rounds were over"
                 )
-                note += f"; {ended}: an attack pays from {summary['pays_ratio']:g} x in the learned scene"
-            rows.append((line, each["deployed"][name], "x no attack", "", None, note))
+                note += (
+                    f"; {ended}: an attack pays above {summary['pays_m']:g} m per tick in the learned scene"
+                )
+            rows.append((line, each["deployed"][name], "m per tick of excess", "", None, note))
     return rows
 
 
@@ -53,15 +53,18 @@ def command_of(experiment: Experiment) -> str:
     """What makes these rounds: the manifest's command may be of something else that has used the run folder since."""
     file = experiment.file.relative_to(REPOSITORY)
     folder = os.path.relpath(experiment.folder, REPOSITORY)
-    return f"advnerf experiment {file} --setting {experiment.setting} --run-folder {folder}"
+    return f"advnerf experiment run {file} --setting {experiment.setting} --folder {folder}"
 
 
-def publish(found: Path, docs: Path) -> None:
-    """The rounds and their curve into the documentation."""
-    text = (found / "retrain.json").read_text()
+def publish(found: Path, original: Path, docs: Path) -> None:
+    """The rounds, the attacked policies and the curve into the documentation."""
+    text, kept = (found / "retrain.json").read_text(), docs / "results" / "retrain"
     summary = json.loads(text)
-    write_atomically(docs / "results" / "retrain" / "retrain.json", text)
-    retrain_plot.draw(docs / "retraining.png", summary["rounds"], summary["pays_ratio"])
+    write_atomically(kept / "retrain.json", text)
+    for number in range(len(summary["rounds"])):
+        file = found / f"round{number - 1}" / "policy.safetensors" if number else original
+        write_atomically(kept / f"policy_{number}.safetensors", file.read_bytes())
+    retrain_plot.draw(docs / "retraining.png", summary["rounds"], summary["pays_m"])
 
 
 def main() -> None:
@@ -81,7 +84,8 @@ def main() -> None:
         if not options.dry:
             record_row(line, value, unit, target, met, command_of(experiment), note)
     if not options.dry:
-        publish(found, REPOSITORY / "docs")
+        original = Path(victim_spec(experiment, experiment.config.main_victim))
+        publish(found, original, REPOSITORY / "docs")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import SearchRun, load_method
 from advnerf_core.attack.spaces.space import Space
-from advnerf_core.driving.metrics import mean_cte_limit_m
+from advnerf_core.driving.metrics import no_effect_m
 from advnerf_core.report.evidence.hardness import (
     FILE,
     FamilyHardness,
@@ -33,11 +33,6 @@ from nodes.experiment.steps.attack import (
 from nodes.experiment.steps.verdicts import VALIDATED_ON, trained_on
 
 _SEED = 20_000  # no search uses it
-
-
-def margin_m(experiment: Experiment) -> float:
-    """Mean excess per tick that counts as no effect [m]: half of the limit for a victim that drives well without attack."""
-    return 0.5 * mean_cte_limit_m(experiment.limits.off_track_m)
 
 
 def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVerdict:
@@ -70,7 +65,7 @@ def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVer
         textures=count,
         seed=_SEED,
         starts=experiment.config.measure.starts,
-        margin_m=margin_m(experiment),
+        margin_m=no_effect_m(experiment.limits.off_track_m),
         families=tuple(family_hardness(experiment, victim, VALIDATED_ON, count)),
     )
     write_hardness(experiment.folder / FILE, record.with_verdict(verdict))

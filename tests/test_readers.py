@@ -58,7 +58,6 @@ OWN = {  # text that the same function has just written, or already read as a wh
     "nodes/experiment/run/published.py": 1,
     "nodes/experiment/show/experiment_world.py": 1,
     "nodes/experiment/engine/artefact.py": 1,
-    "nodes/lab/carla/capture.py": 1,
     "nodes/lab/trials/plan.py": 1,
     "nodes/lab/worlds/check.py": 2,
     "hardware/cameras/zed/calibration.py": 2,  # the INI file of the camera's maker; configparser refuses a key given twice

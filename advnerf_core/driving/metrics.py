@@ -28,6 +28,11 @@ def mean_cte_limit_m(off_track_m: float = LAB_OFF_TRACK_M) -> float:
     return MEAN_CTE_SHARE * off_track_m
 
 
+def no_effect_m(off_track_m: float = LAB_OFF_TRACK_M) -> float:
+    """Largest mean excess |CTE| per tick that counts as no effect of an object [m]: half of what a policy that drives may deviate without one."""
+    return 0.5 * mean_cte_limit_m(off_track_m)
+
+
 def drives(mean_cte_m: float, off_track: bool, off_track_m: float = LAB_OFF_TRACK_M) -> bool:
     """Whether a policy drives: it never left the track, and stayed near its path on average.
 

@@ -54,8 +54,10 @@ def test_rows_are_held_against_the_kept_data():
         ("python -m benchmarks.gap gap_room", True),
         ("python -m benchmarks.gap gap_room gap_filament", True),
         ("python -m benchmarks.predictions", True),
-        ("advnerf experiment launch/poses.campaign.yaml", True),  # as rows of before have it
-        ("advnerf experiment launch/poses.experiment.yaml", True),
+        (
+            "advnerf experiment run launch/junction.experiment.yaml --setting retrain --folder runs/retrain",
+            True,
+        ),
         ("advnerf experiment launch/room.experiment.yaml", False),
         ("python -m benchmarks.floors", False),
     ],

@@ -107,11 +107,3 @@ def test_a_set_with_a_claim_and_no_test_is_told(tmp_path):
     assert answer.startswith(
         "1 registered sets are 1 groups of searches in 1 worlds: 1 sets explore, 0 confirm. Over 4 places and 2 victims"
     )
-
-
-def test_rows_of_the_earlier_build_stand_under_a_warning_and_only_there():
-    for question in QUESTIONS:
-        page = (PAGE.parent / "results" / f"{question.slug}.md").read_text()
-        assert ("**Results of an earlier build.**" in page) == question.lost
-    assert "**Results of an earlier build.**" in (PAGE.parent / "results" / "first_build.md").read_text()
-    assert sum(question_of(row["command"]).lost for row in read_rows()) == 66

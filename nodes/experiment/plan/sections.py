@@ -365,9 +365,10 @@ class RetrainConfig(StrictModel):
     """The defence: how often the victim is retrained against the attack, and its training data."""
 
     rounds: Positive = Field(default=1, description="Rounds of attack and retraining, at most.")
-    pays_ratio: PositiveNumber = Field(
-        default=1.5,
-        description="The loop ends when no attack's total CTE in the surrogate is this many times that of none.",
+    pays_m: float | None = Field(
+        default=None,
+        description="The loop ends when no attack's excess |CTE| per tick in the surrogate is above this [m]; none: what counts as no effect, a tenth of "
+        "the off-track distance. Below zero, all rounds are run.",
     )
     stills: Positive = Field(
         default=120, description="Poses about each path, per domain, seen plain and with a found texture."

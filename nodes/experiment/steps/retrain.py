@@ -23,6 +23,7 @@ from advnerf_core.attack.on_device import on_chosen_device
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.spaces.space import ColourSpace
 from advnerf_core.documents import read_json
+from advnerf_core.driving.metrics import no_effect_m
 from advnerf_core.files import write_json
 from advnerf_core.learning.frames import Frames, FrameStore
 from advnerf_core.learning.recipe import SourcePlan, labelled, near, recovery_states
@@ -41,7 +42,7 @@ from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import placed_objects
 from nodes.experiment.show.spaces import colour_space, random_placements
 from nodes.experiment.show.victims import load_victim
-from nodes.experiment.steps.attack import attack_problem, load_shown, surrogate_part
+from nodes.experiment.steps.attack import attack_problem, from_measured_starts, load_shown, surrogate_part
 from nodes.experiment.steps.frozen import freeze
 from nodes.experiment.steps.policy import plans
 from nodes.experiment.steps.steering_gate import require_same_steering
@@ -60,11 +61,11 @@ class Found:
 
     Attributes:
         thetas: Colours of all objects by scenario ``[K, 3]``.
-        ratios: Total CTE against no attack, by domain and scenario.
+        excess_m: |CTE| per tick over that past the plain objects [m], by domain and scenario.
     """
 
     thetas: dict[str, torch.Tensor]
-    ratios: dict[str, dict[str, float]]
+    excess_m: dict[str, dict[str, float]]
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
@@ -79,6 +80,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     file, rounds, kept = Path(victim_spec(experiment, main)), [], _old_frames(experiment)
     victim = load_policy(file)
     thetas: list[torch.Tensor] = []
+    pays_m = pays_from_m(experiment)
     with experiment.open_world() as scene:
         dressed = stand_in(
             experiment,
@@ -94,20 +96,20 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             here = folder / f"round{number}"
             told = _part(report, number / (wanted.rounds + 1), 1.0 / (wanted.rounds + 1), f"round {number}")
             found = first if number == 0 else attacks.again(victim, here, told)
-            rounds.append({"victim": victim.sha256, **found.ratios})
+            rounds.append({"victim": victim.sha256, **found.excess_m})
             if number == 1:
                 old_attacks = attacks.old(folder / "round0" / "policy.safetensors", first)
             summary = {
                 "rounds": rounds,
                 "old_attacks": old_attacks,
-                "pays_ratio": wanted.pays_ratio,
+                "pays_m": pays_m,
                 "final_policy": os.path.relpath(file, experiment.folder),
                 "settings_hash": hash_of(wanted.model_dump(mode="json")),
             }
             # After every round: a loop takes hours, and may be interrupted.
             write_json(folder / "retrain.json", summary)
-            retrain_plot.draw(folder / "curve.png", rounds, wanted.pays_ratio)
-            if number == wanted.rounds or not max(found.ratios["surrogate"].values()) >= wanted.pays_ratio:
+            retrain_plot.draw(folder / "curve.png", rounds, pays_m)
+            if number == wanted.rounds or not max(found.excess_m["surrogate"].values()) > pays_m:
                 break
             thetas += list(found.thetas.values())
             new = _collect(experiment, scene, victim, thetas, here, told)
@@ -118,6 +120,13 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             if not file.exists():
                 fine_tune(victim, kept, new, settings, file, _stepping(told, wanted.steps))
             victim, kept = load_policy(file), [*kept, *new]
+
+
+def pays_from_m(experiment: Experiment) -> float:
+    """Excess |CTE| per tick above which an attack pays [m]."""
+    wanted = experiment.config.retrain
+    assert wanted is not None, "the stage runs only where the experiment asks for it"
+    return no_effect_m(experiment.limits.off_track_m) if wanted.pays_m is None else wanted.pays_m
 
 
 def unseen_start(experiment: Experiment, scenario: str) -> torch.Tensor:
@@ -197,23 +206,24 @@ class _Attacks:
         return self._judged(victim, thetas, folder)
 
     def _judged(self, policy: LoadedPolicy, thetas: dict[str, torch.Tensor], folder: Path) -> Found:
-        """Ratios to no attack for the same victim in both domains, from the attack's starts; stored in the folder of the round."""
-        seed, kept = self.experiment.config.seeds[0], folder / "ratios.json"
+        """Excess of each attack for the same victim in both domains, from starts that no search had; stored in the folder of the round."""
+        seed, kept = self.experiment.config.seeds[0], folder / "excess.json"
         digests = [hashlib.sha256(theta.numpy().tobytes()).hexdigest() for theta in thetas.values()]
         key = [policy.sha256, *digests]
         if kept.exists() and (known := read_json(kept))["of"] == key:
-            return Found(thetas, known["ratios"])
-        ratios: dict[str, dict[str, float]] = {"surrogate": {}, "deployed": {}}
+            return Found(thetas, known["excess_m"])
+        excess_m: dict[str, dict[str, float]] = {"surrogate": {}, "deployed": {}}
         for scenario, theta in thetas.items():
-            problem = attack_problem(self.experiment, self.space, policy, scenario, seed)
+            searched = attack_problem(self.experiment, self.space, policy, scenario, seed)
+            problem = from_measured_starts(self.experiment, scenario, searched)
             colours = (theta, self.space.plain.colours)
             learned = [float(evaluate(problem, each)[1].protocol_cte_m.mean()) for each in colours]
-            starts = self.experiment.start_states(scenario, seed)
+            starts = self.experiment.measured_starts(scenario)
             driven = [self._total_cte_m(policy, scenario, starts, each) for each in (theta, None)]
-            ratios["surrogate"][scenario] = learned[0] / learned[1]
-            ratios["deployed"][scenario] = driven[0] / driven[1]
-        write_json(kept, {"of": key, "ratios": ratios})
-        return Found(thetas, ratios)
+            for domain, (attacked_m, plain_m) in (("surrogate", learned), ("deployed", driven)):
+                excess_m[domain][scenario] = (attacked_m - plain_m) / self.experiment.config.horizon
+        write_json(kept, {"of": key, "excess_m": excess_m})
+        return Found(thetas, excess_m)
 
     def _total_cte_m(
         self, policy: LoadedPolicy, scenario: str, starts: torch.Tensor, theta: torch.Tensor | None

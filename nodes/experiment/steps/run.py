@@ -26,6 +26,7 @@ from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.live import check_live
 from nodes.experiment.steps.pipeline import stages_of
+from nodes.experiment.steps.retrain import pays_from_m
 from nodes.lab.worlds.named import known_kind, read_world
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay, StageDisplay
@@ -257,6 +258,6 @@ def prepare_victims(experiment: Experiment) -> None:
     make_ready(replace(experiment, config=config), until="retrain")
     if not Path(victim_spec(experiment, RETRAINED)).exists():
         raise ConfigError(
-            f"expected a retrained policy in {experiment.stage_folder('retrain')}, got none: no attack reaches retrain.pays_ratio = "
-            f"{wanted.pays_ratio:g} (see retrain.json there), so nothing was retrained; lower it, or leave the victim retrained out"
+            f"expected a retrained policy in {experiment.stage_folder('retrain')}, got none: no attack costs more than retrain.pays_m = "
+            f"{pays_from_m(experiment):g} m per tick (see retrain.json there), so nothing was retrained; lower it, or leave the victim retrained out"
         )

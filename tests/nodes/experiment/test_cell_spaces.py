@@ -245,10 +245,10 @@ def test_the_gate_judges_learned_scenes_and_predictions_need_objects_where_they_
 def test_a_defence_that_nothing_asks_for_is_told(
     trained: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = trained.config.model_copy(update={"retrain": RetrainConfig(pays_ratio=9.0)})
+    config = trained.config.model_copy(update={"retrain": RetrainConfig(pays_m=9.0)})
     monkeypatch.setattr(run, "make_ready", lambda *arguments, **options: {})  # ends as no attack pays
     with pytest.raises(
-        ConfigError, match=r"no attack reaches retrain.pays_ratio = 9 .*nothing was retrained"
+        ConfigError, match=r"no attack costs more than retrain.pays_m = 9 m per tick .*nothing was retrained"
     ):
         run.prepare_victims(replace(trained, config=config))
 

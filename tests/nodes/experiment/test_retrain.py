@@ -19,7 +19,7 @@ from nodes.experiment.show.given import victim_spec
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps import attack, retrain
 
-SMALL = RetrainConfig(rounds=1, pays_ratio=1e-6, stills=2, drives=1, drive_steps=2, placements=1, steps=2)
+SMALL = RetrainConfig(rounds=1, pays_m=-9.0, stills=2, drives=1, drive_steps=2, placements=1, steps=2)
 
 
 def silent(fraction: float, text: str = "") -> None:
@@ -65,7 +65,7 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     for name in attacked.config.paths:
         row = found["old_attacks"][name]
         assert row["ratio"] == pytest.approx(row["retrained_attacked_m"] / row["original_undisturbed_m"])
-        assert found["rounds"][0]["surrogate"][name] > 0.0
+        assert abs(found["rounds"][0]["surrogate"][name]) < 6.0  # a mean per tick
     # what it learned from: both domains, all drives, the colours that were found, and random ones where the objects were moved
     store = FrameStore(folder / "round0" / "frames")
     assert sorted(store.names()) == sorted(
@@ -77,7 +77,7 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     picture = cv2.imread(str(folder / "curve.png"))
     assert picture is not None
     assert picture.std() > 10.0
-    assert sorted(file.parent.name for file in folder.glob("*/ratios.json")) == ["round0", "round1"]
+    assert sorted(file.parent.name for file in folder.glob("*/excess.json")) == ["round0", "round1"]
     # once more: everything is there, nothing is collected, trained or searched again
     times = {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")}
     before = load_victim(attacked, RETRAINED).sha256
@@ -85,7 +85,7 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     assert {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")} == times
     assert load_victim(attacked, RETRAINED).sha256 == before
     # one more round goes on from the one that is there
-    twice = SMALL.model_copy(update={"rounds": SMALL.rounds + 1, "pays_ratio": 1e-6})
+    twice = SMALL.model_copy(update={"rounds": SMALL.rounds + 1, "pays_m": -9.0})
     more = replace(attacked, config=attacked.config.model_copy(update={"retrain": twice}))
     retrain.run(more, folder, silent)
     grown = json.loads((folder / "retrain.json").read_text())
@@ -97,7 +97,7 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
 
 @pytest.mark.slow
 def test_an_attack_that_does_not_pay_ends_it(attacked: Experiment) -> None:
-    config = attacked.config.model_copy(update={"retrain": SMALL.model_copy(update={"pays_ratio": 1e6})})
+    config = attacked.config.model_copy(update={"retrain": SMALL.model_copy(update={"pays_m": 1e6})})
     experiment = replace(attacked, config=config)
     folder = attacked.stage_folder("retrain")
     retrain.run(experiment, folder, silent)
