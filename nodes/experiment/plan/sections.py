@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from advnerf_core.attack.methods import GRADIENT_RATE
 from advnerf_core.attack.objectives import CTE
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
-from advnerf_core.strict import Angle, AngularRate, RightAngleRad, StrictModel, at_most
+from advnerf_core.strict import Angle, AngularRate, LengthM, RightAngleRad, StrictModel, at_most
 from nodes.experiment.plan.method_names import ArchitectureReference, ObjectiveReference
 from nodes.experiment.plan.numbers import (
     Count,
@@ -365,7 +365,7 @@ class RetrainConfig(StrictModel):
     """The defence: how often the victim is retrained against the attack, and its training data."""
 
     rounds: Positive = Field(default=1, description="Rounds of attack and retraining, at most.")
-    pays_m: float | None = Field(
+    pays_m: LengthM | None = Field(
         default=None,
         description="The loop ends when no attack's excess |CTE| per tick in the surrogate is above this [m]; none: what counts as no effect, a tenth of "
         "the off-track distance. Below zero, all rounds are run.",

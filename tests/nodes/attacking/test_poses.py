@@ -143,7 +143,7 @@ def test_a_request_that_cannot_be_is_refused(tmp_path, bounds, changes, what):
 
 
 def test_a_request_without_poses_and_bounds_on_the_lane_end_in_one_line(tmp_path, monkeypatch, capsys):
-    assert command(monkeypatch, "landscape", tiny_request(tmp_path / "plain"), "-o", tmp_path / "a") == 2
+    assert command(monkeypatch, "maps", tiny_request(tmp_path / "plain"), "-o", tmp_path / "a") == 2
     assert "expected space.kind places" in capsys.readouterr().err
     on_lane = request_file(tmp_path / "lane", BOUNDS.replace("[-1.5, -1.2]", "[-2.1, -1.9]"))
     assert command(monkeypatch, "run", on_lane, "-o", tmp_path / "b") == 2
