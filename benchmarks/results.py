@@ -159,9 +159,8 @@ def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answ
     head = (
         "# Measured results\n\n"
         + (_PICTURE if sets else "")
-        + "Each figure was written by the command beside it, on the machine and day that its row names. `python -m benchmarks.results` makes these "
-        "pages from `results.json`. `advnerf verify` computes rows of kept drives again; the others were measured once, and what they were "
-        "measured from is not kept. Commands stand as they were given; CHANGELOG.md says how they changed since.\n\n## In short\n\n"
+        + "Each figure was written by the command beside it. `advnerf verify` computes "
+        "rows of kept drives again; the others were measured once. CHANGELOG.md says how commands changed.\n\n## In short\n\n"
         + table(found)
         + (sets and f"\n{sets}")
         + "\n## All rows\n\nA row that misses its target stays, with the reason: [missed targets](results/missed.md).\n\n"

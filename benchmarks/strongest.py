@@ -12,7 +12,7 @@ import numpy as np
 from advnerf_core.driving.metrics import mean_cte_limit_m
 from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.conditions import CONTROLS, style_of
-from advnerf_core.report.evidence.families import COARSE_SEARCHES, RANDOM_FAMILIES
+from advnerf_core.report.evidence.families import COARSE_SEARCHES, RANDOM_ALONE, RANDOM_FAMILIES
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.rows import Key, Outcome
@@ -99,6 +99,8 @@ def strongest_random(folder: Path) -> list[Strongest]:
     by_place: defaultdict[tuple[str, str, str], list[CellResult]] = defaultdict(list)
     for cell in evidence.cells.values():
         searched = cell.victim != NAIVE and cell.method not in CONTROLS
+        if evidence.scenario_of(cell).space.get("kind") in RANDOM_ALONE:
+            continue  # random places or shapes, no textures
         if searched and cell.kept.get("deployed") and evidence.without(cell):
             by_place[cell.scenario, cell.placement, cell.victim].append(cell)
     last = {frozenset(each.attack_id for each in searches): searches for searches in by_place.values()}

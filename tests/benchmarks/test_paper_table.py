@@ -10,8 +10,8 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.page import searched_apart
 from benchmarks.paper_table import PUBLISHED, ledger_rows
 
-CAR, MONITOR, JUNCTION, SIDES = (
-    PUBLISHED / f"paper_{name}" for name in ("car", "monitor", "junction", "junction_sides")
+CAR, MONITOR, JUNCTION, SIDES, SPACES = (
+    PUBLISHED / f"paper_{name}" for name in ("car", "monitor", "junction", "junction_sides", "spaces")
 )
 
 
@@ -53,7 +53,7 @@ def test_the_tests_are_those_of_complete_sets(tmp_path):
     row = ledger_rows(PUBLISHED)[0]
     tests = [
         each
-        for name in (CAR, MONITOR, JUNCTION, SIDES)
+        for name in (CAR, MONITOR, JUNCTION, SIDES, SPACES)
         for each in json.loads((name / "set" / "set.json").read_text())["primary"]
     ]
     assert (row.value, row.unit, row.met) == (len(tests), f"of {len(tests)}", True)

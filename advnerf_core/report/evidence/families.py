@@ -63,7 +63,7 @@ def _note(registration: Registration, key: str) -> str:
     against = list(dict.fromkeys(method for test in tests for method in test.against))
     scenario = registration.scenarios[key]
     if scenario.space.get("kind") in RANDOM_ALONE:
-        return "*Baseline*: random places or shapes, with as many evaluations as the attack; no other method searches these without a gradient."
+        return "*Baseline*: random places or shapes, with as many evaluations."
     marks = list(_marks(against, _methods(registration, key), scenario))
     verdict = f" **{'; '.join(marks)}.**" if marks else ""
     return f"*Baselines*: {', '.join(style_of(name).title for name in against)}, each with as many evaluations as the attack.{verdict}"

@@ -91,7 +91,7 @@ def claim(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
     """The statement of a primary test, in four short sentences."""
     which, row = test["test"], row_of(rows, test, "deployed")
     excess = smaller_excess(row)
-    between = f" (95 % interval {ends(excess.low_m, excess.high_m)} m)" if excess.low_m is not None else ""
+    between = f" ({ends(excess.low_m, excess.high_m)} m)" if excess.low_m is not None else ""
     shown = "" if excess.is_shown else " The interval is not above zero: no effect is shown."
     hit = f"; {collisions(row['collided'])} run into something" if row["collided"] else ""
     return (
@@ -115,7 +115,7 @@ def _other_control(row: Mapping[str, Any], used: Excess) -> str:
 def _against_baseline(test: Mapping[str, Any]) -> str:
     only = len(test["test"]["against"]) == 1
     baseline = f"{style_of(test['baseline']).title}, {'the only baseline run' if only else 'the strongest baseline in the learned scene'}"
-    between = "" if test["low_m"] is None else f", 95 % interval {ends(test['low_m'], test['high_m'])} m"
+    between = "" if test["low_m"] is None else f" ({ends(test['low_m'], test['high_m'])} m)"
     said = f"The difference to {baseline}, is {test['difference_m']:.3f} m{between}"
     if test["p"] is None:
         return f"{said}. {test['reason']}."
