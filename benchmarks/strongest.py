@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.driving.metrics import mean_cte_limit_m
+from advnerf_core.driving.metrics import no_effect_m
 from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.conditions import CONTROLS, style_of
 from advnerf_core.report.evidence.families import COARSE_SEARCHES, RANDOM_ALONE, RANDOM_FAMILIES
@@ -117,7 +117,7 @@ def _of_method(evidence: Evidence, key: Key) -> Strongest:
         _reached([evidence.outcomes(cell, domain) for cell in searches]) for domain in DOMAINS
     )
     scenario = evidence.scenario_of(searches[0])
-    margin_m = 0.5 * mean_cte_limit_m(scenario.off_track_m)
+    margin_m = no_effect_m(scenario.off_track_m)
     return Strongest(*key, len(searches), scenario.evaluations, surrogate, deployed, margin_m)
 
 

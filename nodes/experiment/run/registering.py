@@ -115,8 +115,8 @@ def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario
 def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[PrimaryTest]:
     """The tests on the main victim, per variant and path: the gradient against all baselines, and the coarse gradient against coarse ones.
 
-    Baselines are the methods whose textures neither trained nor judged the victim; of places and shapes it is ``random``. A place without baselines has no test, and neither has one
-    of a claim over places: that samples places, not the searches at one of them.
+    Baselines are the methods whose textures neither trained nor judged the victim; of places and shapes it is ``random``. A place without
+    baselines has no test, and neither has one of a claim over places: that samples places, not the searches at one of them.
 
     Raises:
         SetError: A place with a baseline lacks others that a test needs, or nothing is deployed there.

@@ -42,6 +42,7 @@ READS: Mapping[str, dict[str, Any]] = {
     "retrain": {
         **dict.fromkeys(("retrain", "policy", "space", "attack", "held_cap_m"), True),
         "deploy": {"car", "camera"},
+        "measure": {"starts", "seed"},
         **_CARRIER,
         **_OBJECTS,
         **_DRIVE,

@@ -69,6 +69,16 @@ def test_a_change_redoes_only_what_reads_it(tmp_path: Path, override: str, redon
     assert {name for name in before if before[name] != after[name]} == redone
 
 
+@pytest.mark.parametrize("override", ["measure.starts=4", "measure.seed=7"])
+def test_a_retraining_that_is_judged_from_other_starts_is_judged_again(tmp_path: Path, override: str) -> None:
+    retrains = "retrain={rounds: 1}"
+    before, after = (
+        {stage.name: stage.settings for stage in stages_of(load(tmp_path, retrains, *more))}
+        for more in ((), (override,))
+    )
+    assert {name for name in before if before[name] != after[name]} == {"retrain"}
+
+
 def test_every_shipped_experiment_names_its_world(tmp_path: Path) -> None:
     kinds = {
         file.name.partition(".")[0]: load_experiment(file, "full", [], tmp_path).named_world.kind
