@@ -13,7 +13,6 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import Prepared
-from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment, make_ready
 
 
@@ -34,14 +33,13 @@ def request_text(experiment: Experiment) -> str:
 
 
 def prepare(experiment: Experiment, seed: int | None = None) -> Prepared:
-    """Load scene, policy, calibration and objects of a request, and bake a splat; ``seed`` is its first if not given.
+    """Load scene, policy, calibration and objects of a request, and bake the scene; ``seed`` is its first if not given.
 
     Raises:
         AdvnerfError: A file is missing, damaged, or does not fit the others.
     """
     look_at_given(experiment)
-    if stages_of(experiment):
-        make_ready(experiment, console=Console(quiet=True))
+    make_ready(experiment, console=Console(quiet=True))
     seed = experiment.config.seeds[0] if seed is None else seed
     return Prepared.of(experiment, make_space(experiment, None), searched_cell(experiment, seed))
 

@@ -27,14 +27,15 @@ COMPARED = "baked.json"
 _MOST_LOST_DB = {"field": 0.3, "baked": 10.0 * np.log10(2.0)}
 # Views for which bricks are made: as far from a path as an attack may divert a car [m, for half a lane of 1.75 m], and as turned [rad].
 _VIEWS, _LATERAL_M, _HEADING_RAD, _SEED = 320, 3.0, 0.5, 0
-# A splat is searched through its voxels if these look like it; finished attacks are judged by the splat itself.
+# A scene of the user's own is searched through its voxels if these look like it; finished attacks are judged in the scene itself.
 _LEAST_ALIKE_DB, _COMPARED_VIEWS = 25.0, 16
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Write ``baked.safetensors``, unless the scene cannot be baked or loses quality, and ``baked.json``, which says which."""
     field = load_field(experiment)
-    if field.config.contraction and not experiment.config.scene.bake_unbounded:
+    own = experiment.given_scene is not None
+    if not own and field.config.contraction and not experiment.config.scene.bake_unbounded:
         why = "expected a scene within its box, or scene.bake_unbounded, got one that extends outside it"
         write_json(folder / COMPARED, {"used": False, "why": why})
         return
@@ -45,7 +46,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         write_json(folder / COMPARED, {"used": False, "why": str(error)})
         return
     report(0.8, "comparing")
-    used, found = (_beside_views if experiment.given_scene is None else _beside_splat)(experiment, baked)
+    used, found = (_beside_itself if own else _beside_views)(experiment, baked)
     if used:
         baked.save(baked_file(experiment))
     write_json(folder / COMPARED, {"used": used, **found, "mib": baked.voxels.nbytes / 2**20})
@@ -60,15 +61,15 @@ def _beside_views(experiment: Experiment, baked: BakedScene) -> tuple[bool, dict
     return before_db - after_db <= most_lost_db, found
 
 
-def _beside_splat(experiment: Experiment, baked: BakedScene) -> tuple[bool, dict[str, float]]:
-    """The same for a splat, of which there are no held-out views: it is compared itself."""
-    splat, pinhole = load_field(experiment), experiment.view.pinhole
+def _beside_itself(experiment: Experiment, baked: BakedScene) -> tuple[bool, dict[str, float]]:
+    """The same for a scene of the user's own, of which there are no held-out views: it is compared itself."""
+    scene, pinhole = load_field(experiment), experiment.view.pinhole
     found_db = [
-        psnr(baked.render(pose[None], pinhole)[0].numpy(), splat.render(pose[None], pinhole)[0].numpy())
+        psnr(baked.render(pose[None], pinhole)[0].numpy(), scene.render(pose[None], pinhole)[0].numpy())
         for pose in views_of(experiment)[:: _VIEWS // _COMPARED_VIEWS]
     ]
     mean_db = float(np.mean(found_db))
-    return mean_db >= _LEAST_ALIKE_DB, {"psnr_to_splat_db": mean_db, "least_db": _LEAST_ALIKE_DB}
+    return mean_db >= _LEAST_ALIKE_DB, {"psnr_to_scene_db": mean_db, "least_db": _LEAST_ALIKE_DB}
 
 
 def views_of(experiment: Experiment) -> Array:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.objectives import objective_key
-from advnerf_core.splats.scene_file import is_splat_scene, load_hash
+from advnerf_core.splats.scene_file import load_hash
 from nodes.experiment.engine.artefact import Settings
 from nodes.experiment.engine.stages import Stage
 from nodes.experiment.plan.carriers import ScreenConfig
@@ -65,14 +65,13 @@ _TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "setti
 
 
 def stages_of(experiment: Experiment) -> list[Stage]:
-    """The stages that cells need; the world must not have been opened for them. In a scene of the user's own, a splat is baked.
+    """The stages that cells need; the world must not have been opened for them. A scene of the user's own is only baked.
 
     More rounds of retraining resume from the existing ones.
     """
     config = experiment.config
     if config.own_scene:
-        file = Path(str(experiment.named_world.config.file))
-        return [_bake_own(experiment, file)] if is_splat_scene(file) else []
+        return [_bake_own(experiment, Path(str(experiment.named_world.config.file)))]
     found = [_capture(experiment), _scene(experiment), _bake(experiment), _object(experiment)]
     by_stage = {config.policy_stage(name): name for name in config.trained}
     found += [

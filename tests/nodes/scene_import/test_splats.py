@@ -183,6 +183,6 @@ def test_a_splat_is_a_place_whose_searches_use_its_voxels(tmp_path):
     experiment = load_request(file, (), tmp_path / "run")
     prepared = prepare(experiment)
     baked = read_json(tmp_path / "run" / "bake" / "baked.json")
-    assert baked["psnr_to_splat_db"] > 25.0
+    assert baked["psnr_to_scene_db"] > 25.0
     assert isinstance(load_field(experiment), SplatRenderer)
     assert isinstance(prepared.space.surrogate.background, BakedScene)
