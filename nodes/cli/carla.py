@@ -49,12 +49,18 @@ def carla_check(
         typer.Option("--output", "-o", help="Folder for what the driving camera sees: look at it."),
     ] = None,
 ) -> None:
-    """Say what is right and what is wrong with a server; the world is left unchanged."""
-    from nodes.lab.carla.check import check_server
+    """Hold a server's junction against the contract of a world, as `advnerf scene world check carla`; its settings are put back.
 
+    Exit code 1 if a part of it is not met.
+    """
+    from hardware.worlds.carla.scene import CarlaScene
+    from nodes.lab.worlds.check import check_world
+    from nodes.lab.worlds.named import NamedWorld
+
+    named = NamedWorld("carla", CarlaScene, _config(config, overrides, host, port), "")
     with ends_in_order():
-        checks = check_server(_config(config, overrides, host, port), pictures=pictures)
-    fail_unless(print_findings(checks, "check"))
+        findings = check_world(named, pictures)
+    fail_unless(print_findings(findings))
 
 
 @app.command("junctions")
@@ -67,7 +73,6 @@ def carla_junctions(
     ] = None,
 ) -> None:
     """List a map's junctions: id, place, roads, and how many sets of drives straight, right and left they have."""
-    from hardware.worlds.carla.config import ServerConfig
     from hardware.worlds.carla.connection import connect
     from hardware.worlds.carla.junction import list_junctions
     from hardware.worlds.carla.library import load_carla, read_opendrive, server_answers
@@ -78,7 +83,7 @@ def carla_junctions(
     else:
         server = _config(None, None, host, port).server
         with server_answers("its map"):
-            carla_map = connect(ServerConfig.model_validate(server), library).get_world().get_map()
+            carla_map = connect(server, library).get_world().get_map()
     rows = table("id", "x [m]", "y [m]", "roads", "sets of drives")
     for junction in list_junctions(carla_map, library):
         place = f"{junction.x_m:.1f}", f"{junction.y_m:.1f}"

@@ -11,8 +11,10 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from hardware.worlds.carla.errors import CarlaMapError
+from hardware.worlds.carla.errors import CarlaMapError, CarlaUnreachable
 from nodes.cli.carla import app
+from nodes.lab.worlds import check
+from nodes.lab.worlds.geometry import ground_is_flat
 from nodes.runtime.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]
@@ -47,9 +49,8 @@ def test_an_error_is_one_line(carla):
 def test_check_without_a_server(carla):
     port = nobodys_port()
     done = CliRunner().invoke(app, ["check", "127.0.0.1", "--port", str(port)])
-    assert done.exit_code == 1
-    assert f"expected a CARLA server at 127.0.0.1:{port}" in done.output
-    assert "failure" in done.output
+    assert isinstance(done.exception, CarlaUnreachable)
+    assert f"expected a CARLA server at 127.0.0.1:{port}" in str(done.exception)
 
 
 def test_junctions_of_a_file(carla, TJunction, tmp_path):
@@ -73,11 +74,13 @@ def test_a_misspelt_key_is_told_with_its_line(tmp_path):
     assert f"{path}:2: unknown key server.hostt" in str(done.exception)
 
 
-def test_check_of_a_good_server(as_carla, file):
-    done = CliRunner().invoke(app, ["check", "--config", str(file)])
+def test_check_of_a_good_server(as_carla, file, tmp_path, monkeypatch):
+    monkeypatch.setattr(check, "_CHECKS", (("ground", ground_is_flat),))
+    done = CliRunner().invoke(app, ["check", "--config", str(file), "-o", str(tmp_path / "look")])
     assert done.exit_code == 0, done.output
-    assert "failure" not in done.output
-    assert "the world ticks by itself again" in done.output
+    assert [line.split()[0] for line in done.output.splitlines() if " met " in line][-1] == "ground"
+    assert (tmp_path / "look" / "straight_depth.png").is_file()
+    assert not as_carla.world.settings.synchronous_mode
 
 
 def test_junctions_of_a_server(as_carla, port):
