@@ -1,16 +1,15 @@
-"""Calibration files of lens, scene pose in the motion-capture world, and time offset."""
+"""Calibration files of lens and time offset."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from advnerf_core.data.lens import Lens
-from advnerf_core.data.similarity import Similarity
 from advnerf_core.geometry import Array
-from calibration.schema import Calibration, Intrinsics, Row4, require_rigid
+from calibration.schema import Calibration, Intrinsics, Row4
 
 
 class LensCalibration(Intrinsics):
@@ -22,29 +21,6 @@ class LensCalibration(Intrinsics):
     def lens(self) -> Lens:
         """Distortion."""
         return Lens(self.distortion)
-
-
-class SceneCalibration(Calibration):
-    """Pose and scale of a scene in the motion-capture world: ``world = scale R scene + t``.
-
-    Attributes:
-        scale: Metres per unit of the scene.
-        T_world_from_scene: The rigid part ``R``, ``t`` [m].
-    """
-
-    kind: Literal["mocap_to_scene"] = "mocap_to_scene"
-    scale: float = Field(gt=0.0)
-    T_world_from_scene: tuple[Row4, Row4, Row4, Row4]
-
-    @field_validator("T_world_from_scene")
-    @classmethod
-    def _rigid(cls, rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
-        return require_rigid(rows)
-
-    @property
-    def similarity(self) -> Similarity:
-        """The map from scene to world."""
-        return Similarity(self.scale, np.array(self.T_world_from_scene))
 
 
 class TimeOffsetCalibration(Calibration):

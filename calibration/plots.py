@@ -14,7 +14,6 @@ from advnerf_core.files import refuse_overwriting, write_atomically
 from calibration.camera_to_car import MountFit
 from calibration.display_colour import DisplayFit
 from calibration.intrinsics import IntrinsicsFit
-from calibration.mocap_to_scene import SceneFit
 from calibration.schema import Calibration, CalibrationError, refuse_other_kinds, save_calibration
 from calibration.time_offset import OffsetFit
 from calibration.vehicle import GainsFit
@@ -74,23 +73,6 @@ def mount_plot(figure: Figure, fit: MountFit) -> None:
         ylabel="reprojection error [px]",
     )
     axes.legend()
-
-
-def scene_plot(figure: Figure, fit: SceneFit) -> None:
-    """Cameras in both worlds from above, and the errors of left-out ones."""
-    left, right = figure.subplots(1, 2)
-    inside = fit.alignment.inliers
-    left.plot(
-        fit.T_world_from_camera[:, 0, 3], fit.T_world_from_camera[:, 1, 3], "k+", label="motion capture"
-    )
-    left.plot(fit.placed[inside, 0, 3], fit.placed[inside, 1, 3], ".", label="scene, placed")
-    left.plot(fit.placed[~inside, 0, 3], fit.placed[~inside, 1, 3], "r.", label="outliers")
-    left.set(title="cameras from above", xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    left.legend()
-    right.hist(1000.0 * fit.held_out_m, bins=20)
-    right.set(
-        title="cameras that were left out", xlabel="distance from motion capture [mm]", ylabel="cameras"
-    )
 
 
 def vehicle_plot(figure: Figure, gains: GainsFit, response: ResponseFit) -> None:

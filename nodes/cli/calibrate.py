@@ -184,37 +184,6 @@ def camera_to_car(
     save_and_print(fit.calibration(camera), output, lambda figure: mount_plot(figure, fit))
 
 
-@app.command("mocap-to-scene")
-def mocap_to_scene(
-    output: Output,
-    scene: Annotated[
-        Path,
-        typer.Argument(
-            help="transforms.json of the scene with poses from structure from motion.", exists=True
-        ),
-    ],
-    mocap: Annotated[
-        Path,
-        typer.Argument(
-            help="transforms.json of the same images with motion-capture poses (advnerf scene from-bag).",
-            exists=True,
-        ),
-    ],
-) -> None:
-    """Calibrate scale and pose of a scene in the motion-capture world, from images with poses in both frames."""
-    from advnerf_core.data.transforms import load_transforms
-    from calibration.mocap_to_scene import place_scene
-    from calibration.plots import scene_plot
-
-    keep_inputs(output, scene, mocap)
-    one, two = (
-        {frame.path.name: frame.T_world_from_camera for frame in load_transforms(file).frames}
-        for file in (scene, mocap)
-    )
-    fit = place_scene(one, two)
-    save_and_print(fit.calibration, output, lambda figure: scene_plot(figure, fit))
-
-
 @app.command("vehicle")
 @with_groups
 def vehicle(

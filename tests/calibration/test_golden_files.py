@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from calibration.display_colour import DisplayCalibration
-from calibration.measured import LensCalibration, SceneCalibration, TimeOffsetCalibration
+from calibration.measured import LensCalibration, TimeOffsetCalibration
 from calibration.schema import (
     CalibrationError,
     CameraCalibration,
@@ -41,20 +41,6 @@ views: 190
 residuals: {rms_rad: 0.0021}
 camera_minus_mocap_s: 0.0671
 stddev_s: 0.0004
-""",
-    SceneCalibration: """\
-kind: mocap_to_scene
-date: 2026-11-21
-method: similarity
-notes: ''
-views: 40
-residuals: {held_out_median_m: 0.006}
-scale: 0.37
-T_world_from_scene:
-- [0.0, -1.0, 0.0, 1.5]
-- [1.0, 0.0, 0.0, -2.0]
-- [0.0, 0.0, 1.0, 0.25]
-- [0.0, 0.0, 0.0, 1.0]
 """,
     VehicleCalibration: """\
 kind: vehicle
@@ -117,12 +103,6 @@ def test_files_that_measured_nothing_stay_as_short_as_they_were(tmp_path):
 @pytest.mark.parametrize(
     ("model", "old", "new", "words"),
     [
-        (
-            SceneCalibration,
-            "[0.0, 0.0, 1.0, 0.25]",
-            "[0.0, 0.0, 1.1, 0.25]",
-            "T_world_from_scene: expected a rotation",
-        ),
         (TimeOffsetCalibration, "stddev_s: 0.0004", "stddev_s: -0.1", "stddev_s"),
         (VehicleCalibration, "steering_lag_s: 0.06", "steering_lag_s: .nan", "steering_lag_s"),
         (

@@ -9,12 +9,11 @@ import pytest
 import typer
 import yaml
 
-from advnerf_core.data.transforms_write import write_transforms
 from advnerf_core.geometry import camera_mount, make_transform, planar_pose
 from calibration.by_construction import twin_calibrations
 from calibration.charuco import Board, BoardDetector
 from calibration.display_colour import DisplayCalibration, colours_to_show
-from calibration.measured import LensCalibration, SceneCalibration
+from calibration.measured import LensCalibration
 from calibration.schema import (
     CalibrationError,
     CameraCalibration,
@@ -285,41 +284,6 @@ def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
     assert not (tmp_path / "no.yaml").exists()
 
 
-def test_mocap_to_scene_from_two_transforms_files(tmp_path):
-    rng = np.random.default_rng(3)
-    shift = make_transform(cv2.Rodrigues(np.array([0.2, -0.4, 1.0]))[0], [1.0, 2.0, 0.3])
-    paths, images = [], {"scene": [], "world": []}
-    for k in range(20):
-        path = tmp_path / f"{k:02d}.png"
-        cv2.imwrite(str(path), np.zeros((188, 336, 3), np.uint8))
-        angle = 0.3 * k
-        world = planar_pose(2.0 * np.cos(angle), 1.5 * np.sin(angle), angle) @ camera_mount(
-            0.3, 0.0, 0.2, 0.17
-        )
-        inside = np.linalg.inv(shift) @ world
-        inside[:3, 3] = inside[:3, 3] / 0.5 + rng.normal(0.0, 0.002, 3)
-        paths.append(path)
-        images["scene"].append(inside)
-        images["world"].append(world)
-    for name, listed in images.items():
-        write_transforms(tmp_path / f"{name}.json", paths, np.stack(listed), PINHOLE)
-    assert (
-        run(
-            "car",
-            "calibrate",
-            "mocap-to-scene",
-            tmp_path / "scene.json",
-            tmp_path / "world.json",
-            "-o",
-            tmp_path / "placed.yaml",
-        )
-        == 0
-    )
-    found = load_calibration(SceneCalibration, tmp_path / "placed.yaml")
-    assert found.scale == pytest.approx(0.5, rel=0.01)
-    np.testing.assert_allclose(found.similarity.T_target_from_source, shift, atol=0.01)
-
-
 def test_display_from_a_folder(tmp_path, capsys):
     assert run("car", "calibrate", "display-colours", "-o", tmp_path, "--width", 32, "--height", 18) == 0
     colours = colours_to_show()
@@ -467,7 +431,6 @@ def test_a_board_to_print(tmp_path, capsys):
 GIVEN = {
     "intrinsics": [""],
     "camera-to-car": ["", "--lens", "--pattern"],
-    "mocap-to-scene": ["", " "],
     "vehicle": ["", "--before"],
     "time-offset": ["", "--camera"],
     "display": [""],
