@@ -5,8 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from advnerf_core.geometry import Array
 from hardware.worlds.environments import ENVIRONMENTS
 from hardware.worlds.remote_world import RemoteMeshWorld
+from hardware.worlds.road_photos import road_photo_poses
 
 
 class InstalledWorld(RemoteMeshWorld):
@@ -19,6 +23,8 @@ class InstalledWorld(RemoteMeshWorld):
         lowest_m: See `RemoteWorld`.
         unsent: Further keys of the configuration that the simulator does not know.
     """
+
+    config: Any
 
     def __init__(
         self,
@@ -43,3 +49,9 @@ class InstalledWorld(RemoteMeshWorld):
     def python(self) -> Path:
         """The interpreter of the world's environment; see `RemoteWorld.python`."""
         return self._environment.python()
+
+    def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
+        """Poses along, beside and above the driven paths; see `road_photo_poses`."""
+        description = self.describe()
+        paths, lane_m = list(description.paths.values()), 2.0 * description.off_track_m
+        return road_photo_poses(paths, lane_m, self.config.camera, count, rng)

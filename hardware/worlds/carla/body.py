@@ -54,11 +54,6 @@ class CarlaCar:
         return self._car.state
 
     @property
-    def turn_rate_radps(self) -> float:
-        """True turn rate [rad/s], which lags behind its command."""
-        return self._car.turn_rate_radps
-
-    @property
     def blocked(self) -> bool:
         """Whether the car stands against something solid or at the end of the world."""
         return self._hit or self._car.blocked

@@ -21,19 +21,20 @@ from hardware.worlds.carla.errors import CarlaError, CarlaFrameError
 from hardware.worlds.carla.frames import CarlaPose
 from hardware.worlds.carla.junction import find_drives
 from hardware.worlds.carla.library import load_carla, server_answers
-from hardware.worlds.carla.photos import photo_poses
 from hardware.worlds.carla.pixels import depth_of, rgb_of
 from hardware.worlds.carla.synchronous import TickedWorld, set_scenery
 from hardware.worlds.carla.undo import Undo
 from hardware.worlds.junction.config import UNSEEN_OF_A_CAR
 from hardware.worlds.junction.paths import PathName
 from hardware.worlds.paths import ReferencePath
+from hardware.worlds.road_photos import road_photo_poses
 from hardware.worlds.world import Box, NotOpenError, Rgb, Traits, View, WorldDescription
 
 _log = logging.getLogger(__name__)
 _CLOSING_TIMEOUT_S = 5.0
 _ATTEMPTS = 3  # ticks until a picture of the wanted pose must have come
 _LOW_M, _HIGH_M = -0.5, 20.0  # lower and upper end of the learned box
+_PHOTOGRAPHED_M = 44.0  # of each drive: what is driven, and what a car sees that overshoots
 _FROM_ABOVE_M = (-18.0, 0.0, 22.0)  # camera position of the reports' overview
 
 
@@ -143,8 +144,9 @@ class CarlaScene:
         )
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """Poses ``T_world_from_camera [4, 4]`` along, beside and above the drives, within a lane of them; see `hardware.worlds.carla.photos`."""
-        return photo_poses(self.drives, self.config, count, rng)
+        """Poses ``T_world_from_camera [4, 4]`` along, beside and above the drives; see `road_photo_poses`."""
+        paths = [path.stretch(0.0, min(_PHOTOGRAPHED_M, path.length_m)) for path in self.paths.values()]
+        return road_photo_poses(paths, self.drives.lane_width_m, self.config.camera, count, rng)
 
     def overview(self) -> tuple[Rgb, Pinhole, Array]:
         """A photograph ``[H, W, 3]`` from above the straight drive, its lens, and ``T_world_from_camera [4, 4]``."""
@@ -165,11 +167,6 @@ class CarlaScene:
     def state(self) -> VehicleState:
         """True state of the car."""
         return self._driven.state
-
-    @property
-    def turn_rate_radps(self) -> float:
-        """True turn rate of the car [rad/s], which lags behind its command."""
-        return self._driven.turn_rate_radps
 
     @property
     def blocked(self) -> bool:

@@ -13,7 +13,6 @@ from hardware.worlds.duckietown.config import DuckietownConfig
 from hardware.worlds.fitting import path_through
 from hardware.worlds.installed_world import InstalledWorld
 from hardware.worlds.paths import ReferencePath
-from hardware.worlds.road_photos import road_photo_poses
 from hardware.worlds.world import Box, CarDescription, Traits, WorldDescription, WorldError
 
 RANGE_M = (0.04, 100.0)
@@ -85,12 +84,6 @@ class Duckietown(InstalledWorld):
                 f"expected stretch.route to be one of {', '.join(routes)} of {self.config.map_name}, got {stretch.route}"
             )
         return {stretch.route: routes[stretch.route].stretch(stretch.from_m, stretch.length_m)}
-
-    def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """Poses along, beside and above the routes; see `road_photo_poses`."""
-        description = self.describe()
-        paths, lane_m = list(description.paths.values()), 2.0 * description.off_track_m
-        return road_photo_poses(paths, lane_m, self.config.camera, count, rng)
 
 
 def _named(lines: list[Array]) -> dict[str, ReferencePath]:

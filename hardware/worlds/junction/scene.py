@@ -84,11 +84,6 @@ class Intersection(SeenWorld):
         return self._car.state
 
     @property
-    def turn_rate_radps(self) -> float:
-        """True turn rate of the car [rad/s], which lags behind its command."""
-        return self._car.turn_rate_radps
-
-    @property
     def blocked(self) -> bool:
         """Whether the car stands against a house, a trunk or a post, or at the end of the world."""
         return self._car.blocked

@@ -12,7 +12,6 @@ from hardware.worlds.fitting import fit_lines_and_arcs, path_through
 from hardware.worlds.installed_world import InstalledWorld
 from hardware.worlds.metadrive.config import MetaDriveConfig
 from hardware.worlds.paths import ReferencePath
-from hardware.worlds.road_photos import road_photo_poses
 from hardware.worlds.world import Box, CarDescription, Traits, WorldDescription, WorldError
 
 ROUTE = "route"
@@ -67,13 +66,6 @@ class MetaDrive(InstalledWorld):
             lanes=(path, *lanes),
             road_edge=tuple(_near(arrays["edges"], facts["edges"], stretch)),
             facts={"simulator": str(facts["simulator"])},
-        )
-
-    def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """Poses along, beside and above the driven stretch; see `road_photo_poses`."""
-        description = self.describe()
-        return road_photo_poses(
-            list(description.paths.values()), 2.0 * description.off_track_m, self.config.camera, count, rng
         )
 
     def _path(self, stretch: Array) -> ReferencePath:

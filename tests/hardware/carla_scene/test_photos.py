@@ -2,16 +2,15 @@
 
 import numpy as np
 
-from hardware.worlds import CarlaConfig
-from hardware.worlds.carla.config import JunctionConfig
-from hardware.worlds.carla.junction import find_drives
-from hardware.worlds.carla.photos import photo_poses
+from hardware.worlds import CarlaConfig, CarlaScene
 
 
-def test_photographs_are_along_the_lanes_and_above(carla, TJunction):
-    drives = find_drives(carla.Map("written", TJunction().text()), carla, JunctionConfig())
-    T = np.array(photo_poses(drives, CarlaConfig(), 300, np.random.default_rng(1)))
-    raised = T[:, 2, 3] > 2.5
+def test_photographs_are_along_the_lanes_and_above(library, settings):
+    with CarlaScene(CarlaConfig.model_validate(settings), library) as scene:
+        drives, photo_poses = scene.drives, scene.photo_poses
+        T = np.array(photo_poses(300, np.random.default_rng(1)))
+        repeated = photo_poses(30, np.random.default_rng(1))
+    raised = T[:, 2, 3] > 2.2
     assert raised.sum() == 60
     assert (
         0.0 < np.median(np.degrees(np.arcsin(-T[~raised, 2, 2]))) < 16.0
@@ -26,5 +25,4 @@ def test_photographs_are_along_the_lanes_and_above(carla, TJunction):
     for path in drives.paths.values():
         start = np.hypot(x - path.start_pose[0], y - path.start_pose[1])
         assert (start < 12.0).sum() > 5
-    repeated = photo_poses(drives, CarlaConfig(), 30, np.random.default_rng(1))
     np.testing.assert_array_equal(repeated, T[:30])
