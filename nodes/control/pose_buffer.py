@@ -7,6 +7,7 @@ median error is 6 mm, but 0.1 mm with interpolation at the stamp.
 from __future__ import annotations
 
 from bisect import bisect_left, insort
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from advnerf_core.geometry import interpolate_transform
 
 _NS_PER_S = 1_000_000_000
+_WHOLE_RECORDING_S = 1e6
 # Shortest time over which velocity is estimated. Over one period of the stream, the estimate would be mostly noise.
 _VELOCITY_BASE_S = 0.02
 
@@ -48,6 +50,16 @@ class PoseBuffer:
         self._stamps: list[int] = []
         self._poses: dict[int, NDArray[np.float64]] = {}
         self._late = False
+
+    @classmethod
+    def of_recording(
+        cls, poses: Iterable[tuple[int, NDArray[np.float64]]], max_gap_s: float = 0.1
+    ) -> PoseBuffer:
+        """Keep all poses of a recording, given with their stamps [ns]."""
+        buffer = cls(_WHOLE_RECORDING_S, max_gap_s)
+        for stamp_ns, T in poses:
+            buffer.add(stamp_ns, T)
+        return buffer
 
     def __len__(self) -> int:
         return len(self._stamps)

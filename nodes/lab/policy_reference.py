@@ -86,9 +86,7 @@ def from_twin(view: PolicyView, count: int = 48) -> ReferenceFrames:
 
 def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> ReferenceFrames:
     """Take reference frames spread over a bag, labelled by the expert at the recorded poses."""
-    poses = PoseBuffer(keep_s=1e6)
-    for stamp, T in read_poses(bag, _CAR):
-        poses.add(stamp, T)
+    poses = PoseBuffer.of_recording(read_poses(bag, _CAR))
     topic = image_topic(bag)
     recorded = next(row.count for row in read_info(bag).topics if row.name == topic)
     wanted = set(np.linspace(0, recorded - 1, min(count, recorded)).astype(int).tolist())

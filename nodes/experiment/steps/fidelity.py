@@ -220,9 +220,7 @@ def _along_the_drive(
 
 def posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
     """Frames that were captured while the car was armed, evenly thinned out for a long drive, and the car's states ``[N, 3]`` at their stamps."""
-    poses = PoseBuffer(keep_s=1e6)
-    for stamp, T in read_poses(bag, _CAR):
-        poses.add(stamp, T)
+    poses = PoseBuffer.of_recording(read_poses(bag, _CAR))
     armed = [stamp_ns(state) for state in read_decoded(bag, _SAFETY) if state.armed]
     frames, states = [], []
     for image in read_decoded(bag, _IMAGE):

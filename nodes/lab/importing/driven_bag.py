@@ -26,7 +26,6 @@ from nodes.runtime.progress import Report
 CAR_TOPIC = "/vicon/car"
 CAR_CAMERA = "car"
 _ATTACHED_CALIBRATION = "camera.yaml"
-_WHOLE_DRIVE_S = 1e6
 
 
 @dataclass(frozen=True)
@@ -78,9 +77,7 @@ def take_frames(
         ImportRecordingError: The calibration is missing, the image size differs from it, or the frames have no poses.
     """
     camera = _camera(bag, calibration)
-    poses = PoseBuffer(keep_s=_WHOLE_DRIVE_S)
-    for stamp, T in read_poses(bag, CAR_TOPIC):
-        poses.add(stamp, T)
+    poses = PoseBuffer.of_recording(read_poses(bag, CAR_TOPIC))
     topic = image_topic(bag)
     stamps = [stamp_ns(message) for message in image_messages(bag, topic)]
     placed = [

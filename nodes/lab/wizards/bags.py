@@ -15,7 +15,7 @@ from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.errors import ConfigError, MissingFileError
-from advnerf_core.geometry import Array, interpolate_transform
+from advnerf_core.geometry import Array
 from calibration.camera_to_car import MountView
 from calibration.charuco import BoardDetector, Detection
 from calibration.degeneracy import DegenerateDataError, mean_transform
@@ -58,16 +58,6 @@ class PoseSeries:
         first, last = np.searchsorted(self.stamps_ns, [stamp - half_ns, stamp + half_ns])
         middle = int(np.searchsorted(self.stamps_ns, stamp))
         return self.T[first:last] if first < middle < last and last - first >= 3 else None
-
-    def at(self, stamp: int, most_gap_ns: int) -> Array | None:
-        """Pose ``[4, 4]`` at a stamp, between two poses; None unless they are at most ``most_gap_ns`` apart."""
-        after = int(np.searchsorted(self.stamps_ns, stamp))
-        if not 0 < after < len(self.stamps_ns):
-            return None
-        start, end = self.stamps_ns[after - 1 : after + 1]
-        if end - start > most_gap_ns:
-            return None
-        return interpolate_transform(self.T[after - 1], self.T[after], float((stamp - start) / (end - start)))
 
 
 def read_poses(bag: Path, topic: str) -> PoseSeries:

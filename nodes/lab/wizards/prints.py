@@ -33,12 +33,13 @@ from calibration.print_measurement import (
 from calibration.print_pose import PrintPose, fit_print
 from calibration.schema import CalibrationError, CameraCalibration, Intrinsics, load_calibration
 from nodes.bags.parts import is_bag_file
+from nodes.control.pose_buffer import PoseBuffer
 from nodes.lab.wizards.bags import CAR, read_frames, read_picture, read_poses
 from nodes.lab.wizards.lens import load_lens
 
 Rgb = NDArray[np.uint8]
 _MOST_VIEWS = 60
-_MOST_GAP_NS = 150_000_000
+_MOST_GAP_S = 0.15
 # Of a length read from a ruler or tape, as a share.
 _RULER_SD = 0.002
 
@@ -202,12 +203,13 @@ def _measure_photograph(
 def _measure_drive(
     bag: Path, record: PrintRecord, sheet: Printable, camera: CameraCalibration
 ) -> MeasuredPrint:
-    poses, views, stamps = read_poses(bag, CAR), [], []
+    recorded, views, stamps = read_poses(bag, CAR), [], []
+    poses = PoseBuffer.of_recording(zip(recorded.stamps_ns.tolist(), recorded.T, strict=True), _MOST_GAP_S)
     for stamp, rgb in read_frames(bag):
         _require_size(rgb, camera, bag.name)
-        T_world_from_car = poses.at(stamp, _MOST_GAP_NS)
-        if T_world_from_car is not None and (markers := _seen(rgb, camera, record.markers)):
-            views.append(PrintView(markers, T_world_from_car @ camera.mount))
+        pose = poses.at(stamp)
+        if pose is not None and (markers := _seen(rgb, camera, record.markers)):
+            views.append(PrintView(markers, pose.T @ camera.mount))
             stamps.append(stamp)
     if not views:
         raise DegenerateDataError(
