@@ -261,7 +261,7 @@ class LiveLab:
     def _light_monitor(self, lab: Lab) -> None:
         changed, shown = self._monitor.take()
         if changed:
-            lab.set_monitor_image(shown)
+            lab.show("monitor", shown)
 
     def _subject_poses(self, mono_ns: int) -> dict[str, Array]:
         # Delayed physics makes poses late, never wrong: an old state with a new stamp would be a car that jumps afterwards.

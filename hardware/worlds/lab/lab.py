@@ -186,28 +186,24 @@ class Lab(SeenWorld):
             self._renderer.place("car", np.eye(4), hidden_groups=(CAR_GROUP,))
 
     def show(self, panel: str, rgb: Rgb | None) -> None:
-        """Show a picture ``[h, w, 3]`` on the monitor.
+        """Show a picture ``[h, w, 3]`` on the whole monitor (row 0 on top); None shows the idle screen again.
 
         Raises:
             WorldError: The panel is no screen.
         """
         if panel != "monitor":
             raise WorldError(f"expected a screen of the lab: monitor; got {panel!r}")
-        self.set_monitor_image(rgb)
-
-    def set_board_image(self, rgb: Rgb | None) -> None:
-        """Show a picture ``[h, w, 3]`` on the board's face (row 0 on top); None makes it plain again."""
-        plain = np.full((2, 2, 3), self.config.board.rgb, dtype=np.float32)
-        self._set_texture("board", textures.to_uint8(plain) if rgb is None else rgb)
-
-    def set_monitor_image(self, rgb: Rgb | None) -> None:
-        """Show a picture ``[h, w, 3]`` on the whole monitor (row 0 on top); None shows the idle screen again."""
         shown = textures.to_uint8(textures.screen_image(256, 144)) if rgb is None else rgb
         if self._optics is None:
             self._set_texture("monitor", shown)
             return
         self._optics.show(shown)
         self._screen_seen_from = None
+
+    def set_board_image(self, rgb: Rgb | None) -> None:
+        """Show a picture ``[h, w, 3]`` on the board's face (row 0 on top); None makes it plain again."""
+        plain = np.full((2, 2, 3), self.config.board.rgb, dtype=np.float32)
+        self._set_texture("board", textures.to_uint8(plain) if rgb is None else rgb)
 
     def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
         """Add a panel to the room, lit like the furniture, or remove it; see `hardware.worlds.world.NativePanels`.
@@ -264,7 +260,7 @@ class Lab(SeenWorld):
         if self._open_renderer is None:
             self._car, self._open_renderer = DrivenCar(self.config), self._new_renderer()
             if self._optics is not None:
-                self.set_monitor_image(None)
+                self.show("monitor", None)
         return self
 
     def _see(self, T_world_from_car: Array, depth: bool) -> View:

@@ -52,7 +52,7 @@ def test_the_cameras_see_it_and_the_default_lab_does_not_change():
     rgb = {}
     for name, optics in (("ideal", MonitorOpticsConfig()), ("office", OFFICE)):
         with Lab(LabConfig(monitor_optics=optics, shadows=False)) as lab:
-            lab.set_monitor_image(shown)
+            lab.show("monitor", shown)
             image = lab.observe_held(at)
             np.testing.assert_array_equal(image, lab.observe_at(1.85, 2.2, 0.5 * np.pi, depth=False)[0])
             T = lab.config.camera.T_car_from_camera

@@ -60,13 +60,13 @@ def test_driving_camera_sees_the_board_where_the_pinhole_projects_it(lab, pose):
 
 
 def test_phone_sees_the_monitor_where_the_pinhole_projects_it(lab):
-    lab.set_monitor_image(chess())
+    lab.show("monitor", chess())
     T = look_at([1.4, 2.0, 0.9], [1.75, 3.15, 0.4])
     image = lab.photograph(T)
     points = transform_points(CONFIG.monitor.T_world_from_face, chess_corners_on_face(CONFIG.monitor))
     expected = lab.photo_pinhole.project(transform_points(invert_transform(T), points))
     error = np.linalg.norm(detect_corners(image, expected) - expected, axis=1)
-    lab.set_monitor_image(None)
+    lab.show("monitor", None)
     assert error.mean() < 0.15
     assert error.max() < 0.5
 
