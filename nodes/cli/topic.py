@@ -39,16 +39,18 @@ def topic_hz(
     duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Time to listen [s].")] = 5.0,
     run_dir: RunDir = None,
 ) -> None:
-    """Measure a topic: rate, gaps, lost messages, and age of the capture stamps."""
+    """Measure a topic: rate, gaps, lost messages, and its delays from capture to publication and to reception."""
     from nodes.launching.watching import find_run_dir, measure_rate
 
     report = measure_rate(find_run_dir(run_dir), topic, duration_s)
     print(f"{topic}: {report.rate_hz:.2f} Hz, {report.messages} messages, {report.lost} lost")
     print(f"gaps: {report.shortest_s * 1e3:.1f} to {report.longest_s * 1e3:.1f} ms")
-    if report.age_median_s is not None and report.age_worst_s is not None:
-        print(
-            f"age of the stamp: median {report.age_median_s * 1e3:.1f} ms, worst {report.age_worst_s * 1e3:.1f} ms"
-        )
+    rows = table("way", "median", "99 %", "worst")
+    for name in ("capture_to_publish", "publish_to_receive", "capture_to_receive"):
+        if (delay := getattr(report, name)) is not None:
+            times = (delay.median_s, delay.p99_s, delay.worst_s)
+            rows.add_row(name.replace("_", " "), *(f"{value * 1e3:.2f} ms" for value in times))
+    print_table(rows)
 
 
 @app.command("echo")
@@ -68,27 +70,3 @@ def topic_echo(
             print(f"{describe(received.message())}\n---", flush=True)
             if count is not None and shown >= count:
                 return
-
-
-@app.command("delay")
-def topic_delay(
-    topic: TopicName,
-    duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Time to listen [s].")] = 5.0,
-    run_dir: RunDir = None,
-) -> None:
-    """Measure the delays of a topic: from capture to publication, and from publication to reception."""
-    from nodes.launching.watching import find_run_dir
-    from nodes.launching.watching_nodes import measure_delay
-
-    report = measure_delay(find_run_dir(run_dir), topic, duration_s)
-    rows = table("way", "median", "99 %", "worst")
-    ways = (
-        ("capture to publish", report.capture_to_publish),
-        ("publish to receive", report.publish_to_receive),
-    )
-    for name, delay in ways:
-        if delay is not None:
-            times = (delay.median_s, delay.p99_s, delay.worst_s)
-            rows.add_row(name, *(f"{value * 1e3:.2f} ms" for value in times))
-    print(f"{topic}: {report.messages} messages")
-    print_table(rows)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -37,16 +36,36 @@ class TopicRow:
 
 
 @dataclass(frozen=True)
+class Delay:
+    """Percentiles of one delay [s]."""
+
+    median_s: float
+    p99_s: float
+    worst_s: float
+
+
+@dataclass(frozen=True)
 class RateReport:
-    """Rate of a topic over a period. Ages are measured from capture stamp to reception."""
+    """Rate and delays of a topic over a period.
+
+    Attributes:
+        messages: Number of received messages.
+        lost: Number of messages that were lost on the way.
+        shortest_s: Shortest time between two messages [s].
+        longest_s: Longest time between two messages [s].
+        capture_to_publish: From the stamp in the header to publication, in real time; None without a header.
+        publish_to_receive: From publication to reception here.
+        capture_to_receive: Age of the stamp at reception, in real time; None without a header.
+    """
 
     messages: int
     lost: int
     rate_hz: float
     shortest_s: float
     longest_s: float
-    age_median_s: float | None
-    age_worst_s: float | None
+    capture_to_publish: Delay | None
+    publish_to_receive: Delay
+    capture_to_receive: Delay | None
 
 
 def find_run_dir(given: Path | None) -> Path:
@@ -123,14 +142,16 @@ def listen(run_dir: Path, topic: str, duration_s: float | None) -> Iterator[Rece
 
 
 def measure_rate(run_dir: Path, topic: str, duration_s: float) -> RateReport:
-    """Listen for ``duration_s`` [s] and measure the rate of a topic."""
-    times, ages, lost = [], [], 0
+    """Listen for ``duration_s`` [s] and measure the rate of a topic, and the age of its messages at publication and reception."""
+    times, published, way, ages, lost = [], [], [], [], 0
     for received in listen(run_dir, topic, duration_s):
-        times.append(received.info.publish_mono_ns)
-        lost += received.info.lost
-        message = received.message()
+        info, message = received.info, received.message()
+        times.append(info.publish_mono_ns)
+        lost += info.lost
+        way.append((info.receive_mono_ns - info.publish_mono_ns) / NS_PER_S)
         if hasattr(message, "header"):
-            ages.append((received.info.receive_real_ns - stamp_ns(message)) / NS_PER_S)
+            published.append((info.publish_real_ns - stamp_ns(message)) / NS_PER_S)
+            ages.append((info.receive_real_ns - stamp_ns(message)) / NS_PER_S)
     if len(times) < 2:
         raise MessageError(
             f"expected at least two messages of {topic} in {duration_s:g} s, got {len(times)}; is its node running?"
@@ -142,9 +163,15 @@ def measure_rate(run_dir: Path, topic: str, duration_s: float) -> RateReport:
         len(gaps) / sum(gaps),
         min(gaps),
         max(gaps),
-        statistics.median(ages) if ages else None,
-        max(ages) if ages else None,
+        _delay(published) if published else None,
+        _delay(way),
+        _delay(ages) if ages else None,
     )
+
+
+def _delay(values_s: list[float]) -> Delay:
+    median_s, p99_s = np.percentile(values_s, [50, 99])
+    return Delay(float(median_s), float(p99_s), max(values_s))
 
 
 def describe(message: Any, indent: str = "") -> str:

@@ -1,4 +1,4 @@
-"""Queries about the nodes of a running launch: their state, their load, and the delays of their topics."""
+"""Queries about the nodes of a running launch: their state and their load."""
 
 from __future__ import annotations
 
@@ -7,44 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 
-from nodes.launching.watching import listen, node_names
+from nodes.launching.watching import node_names
 from nodes.runtime.bus import Bus
-from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.errors import MessageError
-from nodes.runtime.messages import stamp_ns
 from nodes.runtime.paths import lock_path, socket_path
 from nodes.runtime.topics import STATUS_PREFIX, status_topic
 
 SILENT = "silent"
 _MIB = 2**20
 _QUEUE_WORDS = ("inbox_dropped",)
-
-
-@dataclass(frozen=True)
-class Delay:
-    """Percentiles of one delay [s]."""
-
-    median_s: float
-    p99_s: float
-    worst_s: float
-
-
-@dataclass(frozen=True)
-class DelayReport:
-    """Delays of a topic.
-
-    Attributes:
-        messages: Number of received messages.
-        capture_to_publish: From the stamp in the header to publication, in real time; None without a header.
-        publish_to_receive: From publication to reception here.
-    """
-
-    messages: int
-    capture_to_publish: Delay | None
-    publish_to_receive: Delay
 
 
 @dataclass(frozen=True)
@@ -120,26 +92,6 @@ def _process_of(name: str, pid: int) -> psutil.Process | None:
         return process if "--name" in command and command[command.index("--name") + 1] == name else None
     except (psutil.Error, IndexError):
         return None
-
-
-def measure_delay(run_dir: Path, topic: str, duration_s: float) -> DelayReport:
-    """Listen to a topic for ``duration_s`` [s] and measure the age of its messages at publication and reception."""
-    capture, way = [], []
-    for received in listen(run_dir, topic, duration_s):
-        info, message = received.info, received.message()
-        way.append((info.receive_mono_ns - info.publish_mono_ns) / NS_PER_S)
-        if hasattr(message, "header"):
-            capture.append((info.publish_real_ns - stamp_ns(message)) / NS_PER_S)
-    if not way:
-        raise MessageError(
-            f"expected a message of {topic} within {duration_s:g} s, got none; is its node running?"
-        )
-    return DelayReport(len(way), _delay(capture) if capture else None, _delay(way))
-
-
-def _delay(values_s: list[float]) -> Delay:
-    median_s, p99_s = np.percentile(values_s, [50, 99])
-    return Delay(float(median_s), float(p99_s), max(values_s))
 
 
 class NodeWatch:
