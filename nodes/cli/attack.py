@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from nodes.runtime.terminal import Device, Overrides, fail_unless, print_table, table
 
-if TYPE_CHECKING:
-    from nodes.experiment.show.context import Experiment
-
 app = typer.Typer(
     no_args_is_help=True,
-    help="Search for textures and poses, go on with a search, look at and examine attacks.",
+    help="Search for textures and poses, look at and examine attacks.",
 )
 
 RequestFile = Annotated[
@@ -37,39 +34,18 @@ def attack_run(
     device: Device = None,
     overrides: Overrides = None,
 ) -> None:
-    """Search as a request asks, for each of its seeds; ends in one attack file per seed."""
+    """Search as a request asks, for each of its seeds; ends in one attack file per seed. The same command goes on with a stopped search, on the same device to the bit."""
     from advnerf_core.attack.device import use_device
     from nodes.experiment.node.prepare import load_request
+    from nodes.experiment.node.printed import print_attacks
+    from nodes.experiment.node.search import run_attack
     from nodes.lab.plugin_tables import say_code
+    from nodes.runtime.locks import hold_folder
+    from nodes.runtime.progress import ProgressDisplay
 
     use_device(device)
     request = load_request(file, overrides or [], output)
     say_code(request.config.model_dump(mode="json"), file.parent)
-    _run(request)
-
-
-@app.command("resume")
-def attack_resume(
-    folder: Annotated[Path, typer.Argument(help="Folder of 'advnerf attack run'.", exists=True)],
-    device: Device = None,
-) -> None:
-    """Go on with a search that was stopped or killed; on the same device to the bit."""
-    from advnerf_core.attack.device import use_device
-    from nodes.experiment.node.search import kept_request
-    from nodes.lab.plugin_tables import say_code
-
-    use_device(device)
-    request = kept_request(folder)
-    say_code(request.config.model_dump(mode="json"), folder)
-    _run(request)
-
-
-def _run(request: Experiment) -> None:
-    from nodes.experiment.node.printed import print_attacks
-    from nodes.experiment.node.search import run_attack
-    from nodes.runtime.locks import hold_folder
-    from nodes.runtime.progress import ProgressDisplay
-
     with hold_folder(request.folder), ProgressDisplay() as display:
         files = run_attack(request, request.folder, display)
     print_attacks(files)

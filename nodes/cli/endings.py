@@ -19,7 +19,6 @@ _RESUMABLE = (
     ("experiment", "predict"),
     ("experiment", "maps"),
     ("attack", "run"),
-    ("attack", "resume"),
     ("attack", "maps"),
     ("scene", "train"),
     ("policy", "train"),

@@ -136,10 +136,6 @@ def keep_request(experiment: Experiment) -> None:
 
 def kept_request(folder: Path) -> Experiment:
     """The request of a folder."""
-    if not (folder / REQUEST).exists():
-        raise ConfigError(
-            f"expected a folder of 'advnerf attack run' with a {REQUEST}, found none in {folder}"
-        )
     return load_request(folder / REQUEST, folder=folder)
 
 

@@ -198,11 +198,11 @@ def test_a_monitor_in_the_loop_is_searched_through_its_colours_and_the_gradient_
         loaded(file, ["attack.together=true"])
 
 
-def test_show_writes_the_texture_and_resume_needs_a_folder_of_a_run(tmp_path, monkeypatch, capsys):
+def test_show_writes_the_texture_of_a_run_that_was_repeated(tmp_path, monkeypatch, capsys):
     file = tiny_request(tmp_path)
     for command in (
         ["run", str(file), "-o", str(tmp_path / "out")],
-        ["resume", str(tmp_path / "out")],
+        ["run", str(file), "-o", str(tmp_path / "out")],
         ["show", str(tmp_path / "out" / "seed_0.attack.safetensors")],
     ):
         monkeypatch.setattr(sys, "argv", ["advnerf", "attack", *command])
@@ -211,11 +211,6 @@ def test_show_writes_the_texture_and_resume_needs_a_folder_of_a_run(tmp_path, mo
         assert ended.value.code == 0
     assert (tmp_path / "out" / "seed_0.texture.png").exists()
     assert load_attack(tmp_path / "out" / "seed_0.attack.safetensors").attack_id in capsys.readouterr().out
-    monkeypatch.setattr(sys, "argv", ["advnerf", "attack", "resume", str(tmp_path)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 2
-    assert "expected a folder of 'advnerf attack run'" in capsys.readouterr().err
 
 
 def test_the_check_confirms_the_gradient_and_says_so(tmp_path):
@@ -278,7 +273,7 @@ def test_every_result_stands_beside_the_drive_without_attack(tmp_path, monkeypat
     assert beside in printed
     assert "NO DRIVE: without an attack this policy does not drive here" in printed
     assert json.loads((tmp_path / "out" / "seed_0.json").read_text())["clean_drive"] == clean.to_dict()
-    assert command(monkeypatch, "resume", tmp_path / "out") == 0
+    assert command(monkeypatch, "run", file, "-o", tmp_path / "out", *changes) == 0
     assert beside in capsys.readouterr().out
     assert command(monkeypatch, "show", tmp_path / "out" / "seed_0.attack.safetensors") == 0
     shown = capsys.readouterr().out
