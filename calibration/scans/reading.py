@@ -34,7 +34,7 @@ def read_scan(path: Path, options: ScanOptions) -> tuple[str, Scan]:
     if found is None:
         known = "; ".join(f"{each.name} ({each.shown_by})" for each in SCANS)
         raise ScanError(
-            f"{path}: expected a scan of one of the formats {known}, got {_shown(path)}; give the folder that holds these files, or photographs and videos to advnerf scene from-images and from-video"
+            f"{path}: expected a scan of one of the formats {known}, got {_shown(path)}; give the folder that holds these files, or photographs and videos to advnerf scene from-images"
         )
     read, takes = READERS[found.name]
     unused = [f"--{name}" for name in _OPTIONS if name not in takes and getattr(options, name) is not None]

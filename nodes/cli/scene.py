@@ -22,7 +22,7 @@ app = typer.Typer(
     no_args_is_help=True,
     cls=in_panels(
         {
-            "Posed images": ("from-video", "from-images", "from-bag", "from-phone-and-car", "from-scan"),
+            "Posed images": ("from-images", "from-bag", "from-phone-and-car", "from-scan"),
             "Scenes": ("train", "from-splat", "eval", "render", "view", "match-colours", "gate"),
             "Objects": ("object",),
             "Places to drive": ("world", "room", "carla"),

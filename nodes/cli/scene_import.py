@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import signal
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from nodes.lab.importing.data_set import Facts
 
 app = typer.Typer()
-_MOVEMENT = 0.06  # as MediaConfig has it, which takes OpenCV to import
 
 Output = Annotated[
     Path,
@@ -38,15 +36,6 @@ Most = Annotated[
 ]
 OneCamera = Annotated[
     bool, typer.Option("--one-camera", help="All images are from one camera with one focal length (no zoom).")
-]
-Movement = Annotated[
-    float,
-    typer.Option(
-        "--movement",
-        min=0.005,
-        max=0.9,
-        help="Keep a frame when the image has moved by this fraction of its width.",
-    ),
 ]
 ExtentM = Annotated[
     float,
@@ -68,41 +57,9 @@ Calibration = Annotated[
     ),
 ]
 StepM = Annotated[float, typer.Option("--step", min=0.0, help="Distance between two frames of the bag [m].")]
-StepDeg = Annotated[
-    float,
-    typer.Option(
-        "--step-angle",
-        min=0.0,
-        help="Rotation after which the next frame is used even without that distance [deg].",
-    ),
-]
-
-
-@dataclass(frozen=True)
-class MediaOptions:
-    """What ``from-video`` and ``from-images`` share."""
-
-    most: Most = 300
-    one_camera: OneCamera = False
-    extent_m: ExtentM = 4.0
-    seed: Seed = 0
-
 
 # More images that were left out are not listed in the terminal.
 _SHOWN = 50
-
-
-@app.command("from-video")
-@with_groups
-def from_video(
-    media: Media,
-    output: Output,
-    metric: MetricOptions,
-    options: MediaOptions,
-    movement: Movement = _MOVEMENT,
-) -> None:
-    """Estimate poses and lenses of the sharpest frames of videos. Several videos and cameras go into one model."""
-    _from_media(media, output, metric, options, movement)
 
 
 @app.command("from-images")
@@ -111,13 +68,21 @@ def from_images(
     media: Media,
     output: Output,
     metric: MetricOptions,
-    options: MediaOptions,
+    most: Most = 300,
+    one_camera: OneCamera = False,
+    extent_m: ExtentM = 4.0,
+    seed: Seed = 0,
 ) -> None:
-    """Estimate poses and lenses of photographs, optionally with videos.
+    """Estimate poses and lenses of photographs, and of the sharpest frames of videos. All of them go into one model.
 
     The images of a folder share a camera unless their sizes or EXIF data differ.
     """
-    _from_media(media, output, metric, options)
+    from calibration.photo_model import SfmConfig
+    from nodes.lab.importing.data_set import from_media as run
+    from nodes.lab.importing.media import MediaConfig
+
+    config, sfm = MediaConfig(most, one_camera), SfmConfig(seed=seed)
+    _run("from-media", output, lambda report: run(media, output, config, sfm, extent_m, metric, report))
 
 
 @app.command("from-bag")
@@ -126,7 +91,6 @@ def from_bag(
     output: Output,
     calibration: Calibration = None,
     step_m: StepM = 0.1,
-    step_deg: StepDeg = 5.0,
     most: Most = 300,
     margin_m: Annotated[
         float,
@@ -137,7 +101,7 @@ def from_bag(
     from nodes.lab.importing.data_set import from_bag as run
     from nodes.lab.importing.driven_bag import BagConfig
 
-    config = BagConfig(step_m, math.radians(step_deg), most=most)
+    config = BagConfig(step_m, math.radians(5.0), most)
     _run("from-bag", output, lambda report: run(bag, output, config, margin_m, report, calibration))
 
 
@@ -147,9 +111,7 @@ def from_phone_and_car(
     output: Output,
     bag: Annotated[Path, typer.Option(help="Bag of a drive through the same room.", exists=True)],
     calibration: Calibration = None,
-    movement: Movement = _MOVEMENT,
     step_m: StepM = 0.15,
-    step_deg: StepDeg = 8.0,
     most: Most = 200,
     one_camera: OneCamera = False,
     seed: Seed = 0,
@@ -168,8 +130,8 @@ def from_phone_and_car(
     from nodes.lab.importing.driven_bag import BagConfig
     from nodes.lab.importing.media import MediaConfig
 
-    media_config = MediaConfig(movement, most, one_camera)
-    bag_config = BagConfig(step_m, math.radians(step_deg), most=most)
+    media_config = MediaConfig(most, one_camera)
+    bag_config = BagConfig(step_m, math.radians(8.0), most)
     _run(
         "from-phone-and-car",
         output,
@@ -288,25 +250,6 @@ def match_colours(
     result = run(scene, images, output or scene, most)
     print(
         f"{output or scene}: colour map fitted to {result.frames} frames, PSNR {result.before_db:.2f} dB without it, {result.after_db:.2f} dB with it"
-    )
-
-
-def _from_media(
-    media: list[Path],
-    output: Path,
-    metric: MetricOptions,
-    options: MediaOptions,
-    movement: float = _MOVEMENT,
-) -> None:
-    from calibration.photo_model import SfmConfig
-    from nodes.lab.importing.data_set import from_media as run
-    from nodes.lab.importing.media import MediaConfig
-
-    config, sfm = MediaConfig(movement, options.most, options.one_camera), SfmConfig(seed=options.seed)
-    _run(
-        "from-media",
-        output,
-        lambda report: run(media, output, config, sfm, options.extent_m, metric, report),
     )
 
 

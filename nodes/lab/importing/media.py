@@ -28,12 +28,10 @@ class MediaConfig:
     """Settings for the conversion of media to images.
 
     Attributes:
-        movement: Displacement of the picture after which a new frame of a video is due, as a share of its width.
         most: Largest number of images of each video or folder.
         one_camera: Whether all images are from one camera with one focal length.
     """
 
-    movement: float = MOVEMENT
     most: int = 300
     one_camera: bool = False
 
@@ -68,7 +66,7 @@ def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Rep
         folder = output / IMAGES / name
         progress = _part_of(report, index, len(entries))
         if is_video:
-            kept = video.keep_keyframes(files[0], folder, config.movement, config.most, progress)
+            kept = video.keep_keyframes(files[0], folder, MOVEMENT, config.most, progress)
         else:
             kept = _copy_photographs(video.thinned(files, config.most), folder, progress)
         images = tuple(path.relative_to(output).as_posix() for path in kept)

@@ -105,7 +105,7 @@ class LogFacts:
         if is_bag:
             missing = "" if self.has_camera else ", with --calibration, as no camera.yaml is attached"
             return Verdict("learn a scene", True, f"advnerf scene from-bag{missing}")
-        how = "scene from-images or from-video estimates the poses of the camera"
+        how = "scene from-images estimates the poses of the camera"
         return Verdict(
             "learn a scene", True, how + (", or from-bag with the exported bag" if log.poses else "")
         )
