@@ -64,7 +64,7 @@ class LightNode(Node):
         return [Out(COMMANDS, drive_message(self._config.speed_mps, self._steering_rad, stamp_ns(message)))]
 
     def status(self) -> tuple[str, str]:
-        """What `advnerf car node list` says about it."""
+        """What `advnerf car top` says about it."""
         return "active", f"steers {self._steering_rad:+.3f} rad"
 
 

@@ -12,7 +12,7 @@ app = typer.Typer(
     cls=in_panels(
         {
             "Drive": ("arm", "disarm", "teleop", "trial"),
-            "A running launch": ("page", "node", "topic", "top", "keys"),
+            "A running launch": ("page", "topic", "top", "keys"),
             "Devices": ("calibrate", "camera", "motor"),
         }
     ),
@@ -24,7 +24,6 @@ app.command("teleop")(teleop.teleop)
 app.command("trial")(trial.trial)
 app.command("page")(page.page)
 app.command("top")(node.top)
-app.add_typer(node.app, name="node")
 app.add_typer(topic.app, name="topic")
 app.add_typer(keys.app, name="keys")
 app.add_typer(calibrate.app, name="calibrate")

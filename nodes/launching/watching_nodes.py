@@ -14,7 +14,7 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.paths import lock_path, socket_path
 from nodes.runtime.topics import STATUS_PREFIX, status_topic
 
-SILENT = "silent"
+_SILENT = "silent"
 _MIB = 2**20
 _QUEUE_WORDS = ("inbox_dropped",)
 
@@ -50,38 +50,27 @@ class NodeRow:
     queue: int
 
 
-@dataclass(frozen=True)
-class Silence:
-    """State of a node that does not report.
+def _describe_silence(run_dir: Path, name: str) -> tuple[int, str]:
+    """Describe how long a node has not reported, from the lock file that its publisher touches at every status.
 
-    Attributes:
-        pid: Process id; 0 for a process that has ended or runs on another host.
-        text: Time since the last status, and the state of the process.
+    Returns:
+        Process id, 0 for a process that has ended or runs on another host; and time since the last status, and state of the process.
     """
-
-    pid: int
-    text: str
-
-
-def describe_silence(run_dir: Path, name: str) -> Silence:
-    """Describe how long a node has not reported, from the lock file that its publisher touches at every status."""
     lock = lock_path(socket_path(run_dir, status_topic(name)))
     try:
         age_s = max(0.0, time.time() - lock.stat().st_mtime)
         owner = int(lock.read_text(encoding="ascii").strip() or 0)
     except (FileNotFoundError, ValueError):
-        return Silence(0, "has never reported")
+        return 0, "has never reported"
     process = _process_of(name, owner)
     if process is None:
-        return Silence(0, f"last status {age_s:.1f} s ago; its process has ended")
+        return 0, f"last status {age_s:.1f} s ago; its process has ended"
     try:
         stopped = process.status() == psutil.STATUS_STOPPED
     except psutil.Error:
         stopped = False
-    return Silence(
-        owner,
-        f"last status {age_s:.1f} s ago; its process is {'stopped by a signal' if stopped else 'alive'}",
-    )
+    state = "stopped by a signal" if stopped else "alive"
+    return owner, f"last status {age_s:.1f} s ago; its process is {state}"
 
 
 def _process_of(name: str, pid: int) -> psutil.Process | None:
@@ -160,10 +149,10 @@ class NodeWatch:
             return None, None
 
     def _silent(self, name: str) -> NodeRow:
-        silence = describe_silence(self._run_dir, name)
-        cpu, memory = self._usage(self._process(name, silence.pid) if silence.pid else None)
+        pid, text = _describe_silence(self._run_dir, name)
+        cpu, memory = self._usage(self._process(name, pid) if pid else None)
         restarts = self._restarts.get(name, 0)
-        return NodeRow(name, silence.pid, SILENT, silence.text, cpu, memory, 0.0, 0, 0, restarts, 0)
+        return NodeRow(name, pid, _SILENT, text, cpu, memory, 0.0, 0, 0, restarts, 0)
 
     def _row(self, name: str) -> NodeRow:
         (began, first), (ended, last) = self._first[name], self._last[name]

@@ -121,31 +121,28 @@ def test_topic_list_names_publishers(running, command):
 
 
 def test_a_node_that_hangs_is_listed_as_silent_with_its_age(running, command):
-    _, output, _ = command("car", "node", "list", "--folder", running)
+    top = ("car", "top", "--period", "1.0", "--count", "1", "--folder", running)
+    _, output, _ = command(*top)
     rows = {line.split()[0]: line.split() for line in output.splitlines()}
     pid = int(rows["sender"][2])
     assert rows["sender"][1] == "active"
     os.kill(pid, signal.SIGSTOP)
     try:
         time.sleep(0.3)
-        code, output, _ = command("car", "node", "list", "--folder", running)
-        _, top, _ = command("car", "top", "--period", "0.5", "--count", "1", "--folder", running)
+        code, output, _ = command(*top)
     finally:
         os.kill(pid, signal.SIGCONT)
     silent = (
-        rf"(?m)^sender +silent +{pid} +last status (\d+\.\d) s ago; its process is stopped by a signal *$"
+        rf"(?m)^sender +silent +{pid} .* last status (\d+\.\d) s ago; its process is stopped by a signal *$"
     )
     assert code == 0
     assert 1.0 <= float(re.search(silent, output)[1]) <= 4.0
-    assert re.search(
-        r"(?m)^sender +silent .*last status \d+\.\d s ago; its process is stopped by a signal", top
-    )
-    assert rows["sender"] == command("car", "node", "list", "--folder", running)[1].splitlines()[1].split()
+    again = command(*top)[1].splitlines()[1].split()
+    assert again[:3] + again[10:] == rows["sender"][:3] + rows["sender"][10:]
 
 
-@pytest.mark.parametrize("words", [("node", "list"), ("top", "--period", "0.5")])
-def test_a_folder_without_nodes_is_no_empty_table(tmp_path, command, words):
-    code, _, error = command("car", *words, "--folder", tmp_path)
+def test_a_folder_without_nodes_is_no_empty_table(tmp_path, command):
+    code, _, error = command("car", "top", "--period", "0.5", "--folder", tmp_path)
     assert (code, f"expected nodes of a launch in {tmp_path}, found none" in error) == (2, True)
 
 
