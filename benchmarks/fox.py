@@ -112,7 +112,7 @@ def main() -> None:
 def report(at: TrainingReport) -> None:
     if at.step % 250 == 0:
         print(
-            f"step {at.step}: {at.psnr_db:.2f} dB on training rays, {at.rays} rays, {at.eta_s:.0f} s left",
+            f"step {at.step}: {at.psnr_db:.2f} dB on training rays, {at.eta_s:.0f} s left",
             flush=True,
         )
 

@@ -313,13 +313,7 @@ class Trainer:
         if progress is None:
             return
         left = self.elapsed_s * (1.0 - self.fraction) / max(self.fraction, 1e-6)
-        rays, samples = sum(r.rays for r in recent), sum(r.samples for r in recent)
-        loss = float(np.mean([r.loss for r in recent]))
-        progress(
-            TrainingReport(
-                self.step, self.fraction, loss, psnr_db, left, recent[-1].rays, samples / max(rays, 1)
-            )
-        )
+        progress(TrainingReport(self.step, self.fraction, psnr_db, left))
 
 
 def train_scene(

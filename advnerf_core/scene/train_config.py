@@ -96,20 +96,14 @@ class TrainingReport:
     Attributes:
         step: Number of finished steps.
         fraction: Finished share of the training, by steps or time, whichever is ahead.
-        loss: Huber loss, averaged over recent steps.
         psnr_db: PSNR of recent batches [dB].
         eta_s: Estimated remaining time [s].
-        rays: Rays in the last step.
-        samples_per_ray: Mean samples on a ray.
     """
 
     step: int
     fraction: float
-    loss: float
     psnr_db: float
     eta_s: float
-    rays: int
-    samples_per_ray: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ __all__ = [
     "BagInfo",
     "BagMessage",
     "BagWriter",
-    "Diagnosis",
     "SplitLimits",
     "TopicInfo",
     "diagnose",
@@ -24,7 +23,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from nodes.bags.check import Diagnosis, diagnose
+    from nodes.bags.check import diagnose
     from nodes.bags.info import BagInfo, BagMessage, TopicInfo
     from nodes.bags.reader import (
         extract_attachments,
@@ -40,7 +39,7 @@ else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
-            "nodes.bags.check": "Diagnosis diagnose",
+            "nodes.bags.check": "diagnose",
             "nodes.bags.info": "BagInfo BagMessage TopicInfo",
             "nodes.bags.reader": "extract_attachments read_attachment read_attachments read_info read_messages",
             "nodes.bags.repair_parts": "repair_bag",

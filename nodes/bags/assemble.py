@@ -35,11 +35,6 @@ class FileLayout:
     parts: list[range | bytes]
 
     @property
-    def size(self) -> int:
-        """Size of the new file [bytes]."""
-        return sum(map(len, self.parts))
-
-    @property
     def unchanged(self) -> int:
         """Number of bytes at the beginning that are the same as in the old file."""
         at = 0

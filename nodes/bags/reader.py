@@ -299,8 +299,7 @@ def _say_unchecked(path: Path, reason: str) -> None:
 
 def _unfinished(path: Path) -> BagError:
     """Error about an unfinished file, with advice that depends on its contents."""
-    lines = diagnose(path).lines
-    return BagError(f"{path} is unfinished: its recorder was killed; {'; '.join(lines[-2:])}")
+    return BagError(f"{path} is unfinished: its recorder was killed; {'; '.join(diagnose(path)[-2:])}")
 
 
 @lru_cache(maxsize=4)

@@ -45,11 +45,11 @@ def bag_info(
     from nodes.bags.time_gaps import read_gaps, silence_s
 
     if not quick:
-        for found in map(diagnose, bag_parts(bag)):
-            if not found.whole:
-                for line in found.lines[:-1]:
-                    print(f"{found.path}: {line}")
-                say_error(f"{found.path} is damaged; {found.lines[-1]}")
+        for part in bag_parts(bag):
+            if lines := diagnose(part):
+                for line in lines[:-1]:
+                    print(f"{part}: {line}")
+                say_error(f"{part} is damaged; {lines[-1]}")
                 raise typer.Exit(_DAMAGED_EXIT)
     info, gaps = read_info(bag), read_gaps(bag)
     span_s = info.duration_s - silence_s(gaps)

@@ -320,14 +320,14 @@ class Bus:
         """Number of subscribers connected to a topic that this process publishes."""
         return self.publisher(topic).subscribers()
 
-    def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float, count: int = 1) -> None:
-        """Wait until every topic has ``count`` subscribers. ZeroMQ drops messages that are sent before."""
+    def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float) -> None:
+        """Wait until every topic has a subscriber. ZeroMQ drops messages that are sent before."""
         deadline = time.monotonic() + timeout_s
         waiting = list(topics)
-        while waiting := [name for name in waiting if self.subscribers(name) < count]:
+        while waiting := [name for name in waiting if not self.subscribers(name)]:
             if time.monotonic() > deadline:
                 raise BusError(
-                    f"expected {count} subscriber(s) of {', '.join(waiting)} within {timeout_s:g} s, got fewer; is the receiving node running "
+                    f"expected a subscriber of {', '.join(waiting)} within {timeout_s:g} s, got none; is the receiving node running "
                     f"with the same --folder ({self._run_dir})?"
                 )
             time.sleep(0.005)

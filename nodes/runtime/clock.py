@@ -32,11 +32,6 @@ class Now:
     asleep_ns: int | None = None
 
     @property
-    def mono_s(self) -> float:
-        """Monotonic time [s]."""
-        return self.mono_ns / NS_PER_S
-
-    @property
     def real_s(self) -> float:
         """Real time [s since 1970]."""
         return self.real_ns / NS_PER_S

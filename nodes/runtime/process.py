@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from advnerf_core.errors import AdvnerfError
 from nodes.runtime.bus import Bus
-from nodes.runtime.clock import Clock, SystemClock
+from nodes.runtime.clock import SystemClock
 from nodes.runtime.config import load_node_config
 from nodes.runtime.errors import BagError, ConfigError, NodeFinished, TopicError
 from nodes.runtime.loop import NodeLoop
@@ -59,7 +59,6 @@ def run_node(
     build: Callable[[NodeContext], Node],
     name: str,
     run_dir: Path,
-    clock: Clock | None = None,
     on_loop: Callable[[NodeLoop], None] | None = None,
 ) -> int:
     """Run a node until SIGINT, SIGTERM, `NodeFinished` or an exception.
@@ -74,10 +73,9 @@ def run_node(
         Exit code: 0 after a regular end, 1 after a fault (one line on stderr, traceback in ``<run_dir>/logs``), 2 if the node
         cannot be built with this configuration (one line on stderr).
     """
-    clock = clock or SystemClock()
     in_main_thread = threading.current_thread() is threading.main_thread()
     signals = _Signals() if in_main_thread else None
-    runner = _Runner(name, Path(run_dir), clock)
+    runner = _Runner(name, Path(run_dir))
     try:
         runner.start(build)
         if signals is not None and runner.loop is not None:
@@ -101,8 +99,8 @@ def run_node(
 class _Runner:
     """Builds, runs and takes down one node in the right order."""
 
-    def __init__(self, name: str, run_dir: Path, clock: Clock) -> None:
-        self._name, self._run_dir, self._clock = name, run_dir, clock
+    def __init__(self, name: str, run_dir: Path) -> None:
+        self._name, self._run_dir, self._clock = name, run_dir, SystemClock()
         self._bus: Bus | None = None
         self._node: Node | None = None
         self.loop: NodeLoop | None = None

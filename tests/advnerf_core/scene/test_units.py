@@ -117,7 +117,7 @@ def test_what_one_colour_reaches_follows_from_the_spread_of_colours():
     images = ImageSet(rgb, (LENS,), np.eye(4)[None])
     assert one_colour_db(images) == pytest.approx(-10 * np.log10(0.25))
     check = LearningCheck(images)
-    at = TrainingReport(100, 0.5, 0.1, 6.5, 1.0, 10, 10.0)
+    at = TrainingReport(100, 0.5, 6.5, 1.0)
     assert check(dataclasses.replace(at, step=50)) is None
     assert "6.5 dB on training rays, one colour for all gives 6.0 dB" in check(at)
     assert check(at) is None, "told once"
