@@ -5,7 +5,6 @@ On the loopback interface Zenoh's access control denies every message of a link 
 
 from __future__ import annotations
 
-import ipaddress
 import re
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 from pydantic import Field, field_validator
 
 from advnerf_core.strict import StrictModel
+from nodes.linking.keys import is_loopback
 from nodes.linking.sockets import MOST_BYTES
 from nodes.runtime.errors import SecurityError
 
@@ -119,19 +119,11 @@ def address_of(endpoint: str) -> tuple[str, int]:
 
 def _require_loopback(endpoints: tuple[str, ...]) -> None:
     for endpoint in endpoints:
-        host, _ = address_of(endpoint)
-        if host != "localhost" and not _is_loopback(host):
+        if not is_loopback(address_of(endpoint)[0]):
             raise SecurityError(
                 f"{endpoint} is not on this computer, but interface is a loopback; set the interface of that network and"
                 " open_to_network: true, or use localhost"
             )
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _only_on(interface: str) -> dict[str, Any]:
