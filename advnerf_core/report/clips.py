@@ -1,7 +1,4 @@
-"""First-person clips: one or several drives side by side, captioned, small enough to embed in a page.
-
-H.264 in MP4 if PyAV's FFmpeg has libx264, else VP9 in WebM: browsers play both.
-"""
+"""First-person clips: one or several drives side by side, captioned, small enough to embed in a page, as H.264 in MP4."""
 
 from __future__ import annotations
 
@@ -71,24 +68,19 @@ def write_clip(
     """Write drives side by side as one video, atomically, as fine as the size limit allows.
 
     Args:
-        path: Output file; the suffix is replaced by the container's.
+        path: Output file, ``.mp4``.
         tracks: The drives, left to right, of one frame size; a shorter one holds its last frame.
         rate_hz: Frames per second.
         off_track_m: ``|CTE|`` above this is shown as off-track [m].
-
-    Returns:
-        The file written: ``.mp4``, or ``.webm`` without libx264.
     """
     if not tracks:
         raise ValueError("expected at least one drive for a clip, got none")
-    codec, suffix = ("libx264", ".mp4") if "libx264" in av.codecs_available else ("libvpx-vp9", ".webm")
-    path = path.with_suffix(suffix)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{suffix}")
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
     try:
         for quality in _QUALITIES:
             frames = compose(tracks, rate_hz, off_track_m)
-            _encode(temporary, codec, rate_hz, frames, _small(codec, quality))
+            _encode(temporary, rate_hz, frames, {"crf": str(quality), "preset": "slow", "tune": "animation"})
             size = temporary.stat().st_size
             if size <= MAX_BYTES:
                 os.replace(temporary, path)
@@ -112,7 +104,7 @@ def write_video(path: Path, frames: Iterable[Frames], rate_hz: float = 10.0) -> 
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
     try:
-        _encode(temporary, "libx264", rate_hz, frames, {})
+        _encode(temporary, rate_hz, frames, {})
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -149,7 +141,7 @@ def webp(frames: Sequence[Image.Image], frame_ms: float, quality: int) -> bytes:
 
 def film_uri(file: Path) -> str:
     """A film, which `write_clip` wrote, as a data URI."""
-    return _data_uri(f"video/{file.suffix[1:]}", file.read_bytes())
+    return _data_uri("video/mp4", file.read_bytes())
 
 
 def image_uri(image: Frames, quality: int | None = None) -> str:
@@ -171,24 +163,14 @@ def frame_of(path: Path, number: int) -> Frames:
     return frame
 
 
-def _small(codec: str, quality: int) -> dict[str, str]:
-    """The encoder's options for a small file."""
-    if codec == "libx264":
-        return {"crf": str(quality), "preset": "slow", "tune": "animation"}
-    return {"crf": str(quality), "b": "0", "deadline": "good", "cpu-used": "3"}
-
-
-def _encode(
-    path: Path, codec: str, rate_hz: float, frames: Iterable[Frames], options: dict[str, str]
-) -> None:
+def _encode(path: Path, rate_hz: float, frames: Iterable[Frames], options: dict[str, str]) -> None:
     """Encode images; of an odd size without their last row or column, as 4:2:0 video has even sides."""
     # With the index in front a page can play the clip while it loads.
-    container_options = {"movflags": "+faststart"} if path.suffix == ".mp4" else {}
-    with av.open(str(path), "w", options=container_options) as container:
+    with av.open(str(path), "w", options={"movflags": "+faststart"}) as container:
         stream: Any = None
         for frame in frames:
             if stream is None:
-                stream = container.add_stream(codec, rate=round(rate_hz), options=options)
+                stream = container.add_stream("libx264", rate=round(rate_hz), options=options)
                 stream.height, stream.width = (side - side % 2 for side in frame.shape[:2])
                 stream.pix_fmt = "yuv420p"
             even = np.ascontiguousarray(frame[: stream.height, : stream.width])

@@ -19,7 +19,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, over_the_world
 from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import cell_data
-from nodes.experiment.steps.films import film_cell, kept_film
+from nodes.experiment.steps.films import film_cell
 from nodes.experiment.steps.frozen import check_frozen, freeze
 from nodes.experiment.steps.keys import clean_folder, require_known, stages_needed
 from nodes.experiment.steps.live import LiveNodes
@@ -100,7 +100,7 @@ def run_cell(
         data = cell_data(experiment, shared.space, shared.deployed_in, cell, driven, clean, tell, control_m)
         if shared.deployed_in is None or "not_driven_live" in data:
             return data
-        film = kept_film(folder) or film_cell(experiment, shared.scene, shared.space, cell, folder, driven)
+        film = film_cell(experiment, shared.scene, shared.space, cell, folder, driven)
         # Relative to the folder of all cells.
         return {**data, "extra": {**data["extra"], "clip": f"{film.parent.name}/{film.name}"}}
 

@@ -55,11 +55,14 @@ def film_scenario(
 def film_cell(
     experiment: Experiment, scene: World | None, space: Space, cell: Cell, folder: Path, driven: Path
 ) -> Path:
-    """The deployed drive of one cell, from its first start, as ``clip.mp4`` in ``folder``; its files are in the folder ``driven``."""
+    """The deployed drive of one cell, from its first start, as ``clip.mp4`` in ``folder``, unless it is there; its files are in the folder ``driven``."""
+    film = folder / "clip.mp4"
+    if film.exists():
+        return film
     title = f"{style_of(cell.method).title}, {cell.victim}, seed {cell.seed}"
     track = _deployed_track(experiment, scene, space, cell, title, driven)
     _, rate_hz = filmed(experiment.config.dt_s)
-    return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.world.off_track_m)
+    return write_clip(film, [track], rate_hz, experiment.world.off_track_m)
 
 
 def _learned_track(experiment: Experiment, space: Space, cell: Cell, title: str, folder: Path) -> ClipTrack:
@@ -92,11 +95,6 @@ def _deployed_track(
         return _track(experiment, cell, title, views, states, "".join(live["attack_ids"]), note)
     dressed, colours = dress_cell(experiment, scene, space, folder, cell)
     return _track(experiment, cell, title, [dressed.camera_image(state, colours) for state in states], states)
-
-
-def kept_film(folder: Path) -> Path | None:
-    """The film of a cell in its folder; None without one."""
-    return next(folder.glob("clip.*"), None)
 
 
 def filmed(dt_s: float) -> tuple[int, float]:
