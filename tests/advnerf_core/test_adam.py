@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from advnerf_core.adam import Adam
+from advnerf_core.attack.search.descent import Descent
 
 
 def gradients(dtype):
@@ -73,18 +74,17 @@ def test_what_has_no_gradient_stays():
     torch.testing.assert_close(parameters["moves"].detach(), torch.full((2,), 1.0 - 0.1 * 0.5 - 0.1))
 
 
-def test_it_goes_on_from_moments_where_it_was_left():
+def test_a_descent_goes_on_where_it_was_left():
     first, *others = gradients(torch.float32)
-    theta = torch.ones(7, 3)
-    whole = Adam({"theta": theta})
-    whole.step(0.05, {"theta": first})
-    kept = theta.clone()
-    resumed = Adam({"theta": kept}, whole.moments)
+    whole = Descent({"theta": torch.ones(7, 3)}, 0.05)
+    whole.step(first)
+    kept = whole.tensors
+    resumed = Descent(kept, 0.05)
     for gradient in others:
-        whole.step(0.05, {"theta": gradient})
-        resumed.step(0.05, {"theta": gradient})  # its moments are copies, so neither moves the other's
-    assert torch.equal(theta, kept)
-    assert torch.equal(resumed.moments["theta"]["step"], torch.tensor(12.0))
+        whole.step(gradient)
+        resumed.step(gradient)
+    assert torch.equal(whole.theta, resumed.theta)
+    assert torch.equal(kept["step"], torch.tensor(1.0))  # what was kept is a copy
 
 
 def test_it_does_not_import_the_compiler_of_torch():

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advnerf_core.adam import Adam
 from advnerf_core.attack.adjoint import AttackProblem, Totals, adjoint_gradient
 from advnerf_core.attack.methods import FRESH_RUN, GRADIENT_RATE, SearchRun, SearchSettings
+from advnerf_core.attack.search.descent import Descent
 from advnerf_core.attack.search.population import Coarse
 from advnerf_core.attack.search.record import Evaluation, SearchResult
 from advnerf_core.attack.search.search import (
@@ -132,18 +132,17 @@ def climb(
     state = begin(
         run.state_path, fingerprint, lambda: {"theta": coarse.sampled(problem.sensor.initial_theta(start))}
     )
-    theta = state.tensors["theta"].detach().clone()
-    moments = {name: tensor for name, tensor in state.tensors.items() if name != "theta"}
-    adam = Adam({"theta": theta}, {"theta": moments})
-    state.tensors = {"theta": theta, **adam.moments["theta"]}  # which each step changes in place
+    descent = Descent(state.tensors, learning_rate)
 
     def step() -> Evaluation:
         began, number = time.perf_counter(), len(state.history)
-        full = coarse.expand(theta)
-        slope = slope_of(problem.at_draw(number), full)
+        theta = coarse.expand(descent.theta)
+        slope = slope_of(problem.at_draw(number), theta)
         require_finite(slope.loss_m, slope.gradient, number)
-        evaluation = state.record(full, slope.loss_m, slope.totals, time.perf_counter() - began)
-        adam.step(learning_rate, {"theta": coarse.gathered(slope.gradient)})
+        evaluated = theta.clone()  # before Adam changes it in place
+        descent.step(coarse.gathered(slope.gradient))
+        evaluation = state.record(evaluated, slope.loss_m, slope.totals, time.perf_counter() - began)
+        state.tensors = descent.tensors
         return evaluation
 
     return go_on(state, run, fingerprint, evaluations, step)
