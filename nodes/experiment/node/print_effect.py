@@ -19,7 +19,7 @@ from nodes.experiment.node.prepare import prepare
 from nodes.experiment.plan.placed import FLAT
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.own_scene import flat_object
-from nodes.experiment.steps.attack import Prepared, past
+from nodes.experiment.steps.attack import Prepared, past_field
 from nodes.runtime.errors import ConfigError
 
 # The squash has no inverse at 0 and 1.
@@ -108,5 +108,6 @@ def _theta(texture: NDArray[np.uint8]) -> Tensor:
 
 
 def _total_m(prepared: Prepared, shown: Shown) -> float:
-    _, totals = evaluate(past(prepared.problem.undisturbed(), prepared.space, shown), shown.colours)
+    judged = past_field(prepared.experiment, prepared.problem.undisturbed(), prepared.space, shown)
+    _, totals = evaluate(judged, shown.colours)
     return float(totals.protocol_cte_m.mean())
