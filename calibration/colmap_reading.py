@@ -68,6 +68,7 @@ def _read(folder: Path) -> Any:
     try:
         model = pycolmap.Reconstruction(folder)
         poses = [each.cam_from_world().matrix() for each in model.images.values() if each.has_pose]
+        _require_names(model, folder)
     except (ValueError, IndexError, RuntimeError) as error:
         reason = (str(error).splitlines() or [""])[0]
         raise ReconstructionError(
@@ -79,6 +80,17 @@ def _read(folder: Path) -> Any:
             f"expected at least {MIN_IMAGES} images with a pose in {folder}, got {got}; give another model, or run COLMAP's mapper again"
         )
     return model
+
+
+def _require_names(model: Any, folder: Path) -> None:
+    """Names are bytes in COLMAP's files, and pycolmap decodes them when they are asked for."""
+    try:
+        for each in model.images.values():
+            _ = each.name
+    except UnicodeDecodeError as error:
+        raise ReconstructionError(
+            f"expected names of images in UTF-8 in {folder}, got {error.object!r}; copy its files again, or rename the images and run COLMAP again"
+        ) from None
 
 
 def _converted(found: Any, folder: Path, sizes: dict[str, int], parts: int) -> ColmapModel:

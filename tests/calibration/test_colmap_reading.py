@@ -117,6 +117,16 @@ def test_damaged_text_files_are_one_line(tmp_path, name):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(("text", "file"), [(True, "images.txt"), (False, "images.bin")])
+def test_a_name_of_another_encoding_is_one_line(tmp_path, text, file):
+    path = write(synthetic(), tmp_path, text) / file
+    path.write_bytes(path.read_bytes().replace(b"camera000001_frame", b"cam\xe9ra000001_frame", 1))
+    with pytest.raises(
+        ReconstructionError, match=r"expected names of images in UTF-8 in .*, got b'cam\\xe9ra000001_frame"
+    ):
+        read_colmap(tmp_path)
+
+
 def test_poses_that_are_not_numbers_are_refused(tmp_path):
     file = write(synthetic(), tmp_path, rigs=False) / "images.bin"
     data = bytearray(file.read_bytes())
