@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path as FilePath
 from typing import Any
@@ -48,9 +48,11 @@ class Experiment(ExperimentWorld):
 
     Attributes:
         kept: Digests of its stages' outputs when it was loaded, from the run folder, else from the ones stored with the code.
+        given_scene: The learned scene of the user's own, if that is the place; no stage is run then.
     """
 
     kept: Mapping[str, str] = field(default_factory=dict)
+    given_scene: FilePath | None = None
 
     @classmethod
     def resolved_in(cls, folder: FilePath) -> Experiment:
@@ -63,12 +65,11 @@ class Experiment(ExperimentWorld):
         if given_in(config):  # these say what they see; a manifest has every section
             stored = {name: section for name, section in stored.items() if name != "view"}
             config = ExperimentConfig.model_validate(stored, context=context)
-        return cls(config, FilePath(manifest["file"]), folder, manifest["setting"])
+        return cls(config, FilePath(manifest["file"]), folder, manifest["setting"]).with_given_scene()
 
-    @property
-    def given_scene(self) -> FilePath | None:
-        """The learned scene of the user's own, if that is the place; no stage is run then."""
-        return self.named_world.config.file if self.config.own_scene else None
+    def with_given_scene(self) -> Experiment:
+        """The same, which knows the learned scene of the user's own if that is the place."""
+        return replace(self, given_scene=self.named_world.config.file) if self.config.own_scene else self
 
     @property
     def view_settings(self) -> dict[str, Any]:

@@ -54,6 +54,7 @@ def load_experiment(
 
 def _load(experiment: Experiment, document: Document) -> Experiment:
     """An experiment without variants, checked against its world, with the digests of its stages that are stored with the code."""
+    experiment = experiment.with_given_scene()
     for section in (("world",), *([("deploy", "world")] if experiment.config.deploy.world else [])):
         known_kind(document.part(section), experiment.file.parent)
     if experiment.executes or not is_users(experiment.config.world):
