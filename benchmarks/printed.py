@@ -60,7 +60,7 @@ held_cap_m: 1.5
 objects:
   - {{name: board, kind: panel, x_m: 3.0, y_m: -1.8014, z_m: 0.2, yaw_rad: 3.2812, face: {{size_m: 0.6, rgb: [0.5, 0.5, 0.5]{display}}}}}
 space: {{kind: colours, cells: 8}}
-attack: {{starts: 1, evaluations: {evaluations}}}
+attack: {{starts: 3, evaluations: {evaluations}}}
 over: {{method: [gradient], seed: [0]}}
 deploy: {{through: nothing}}
 gate: null
