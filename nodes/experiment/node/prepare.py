@@ -11,7 +11,6 @@ from nodes.experiment.node.request import as_text, require_request
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
-from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import Prepared
 from nodes.experiment.steps.run import load_experiment, make_ready
 
@@ -38,7 +37,6 @@ def prepare(experiment: Experiment, seed: int | None = None) -> Prepared:
     Raises:
         AdvnerfError: A file is missing, damaged, or does not fit the others.
     """
-    look_at_given(experiment)
     make_ready(experiment, console=Console(quiet=True))
     seed = experiment.config.seeds[0] if seed is None else seed
     return Prepared.of(experiment, make_space(experiment, None), searched_cell(experiment, seed))

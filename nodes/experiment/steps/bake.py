@@ -21,6 +21,8 @@ from nodes.runtime.progress import Report
 # Like a stage's version (`pipeline.VERSIONS`). It is part of the keys of results through baked scenes; this stage's digest is not, as its
 # output follows from the scene, and machines differ in the last bits.
 VERSION = 1
+# The same for scenes of the user's own. Since 2, fields are baked, too: a search through the field does not go on through voxels.
+OWN_VERSION = 2
 COMPARED = "baked.json"
 # Largest loss by baking on held-out views [dB]; a scene that loses more is rendered from its field. Where finished attacks are measured in the
 # baked scene too, as in audits, its steering is what the gate compares with real pictures: baking may then double the field's own error.

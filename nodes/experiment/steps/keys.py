@@ -121,7 +121,7 @@ def _common_inputs(experiment: Experiment, deployed: bool = True) -> dict[str, A
     seen = not deployed and config.attack.objective in ON_THE_PATH
     return {
         "version": VERSION,
-        "bake": bake.VERSION,
+        "bake": bake.VERSION if experiment.given_scene is None else bake.OWN_VERSION,
         "world": experiment.seen_settings if seen else experiment.world_settings,
         "deployed_world": experiment.known_deployed.settings if deployed and config.deploy.world else None,
         "view": experiment.view_settings,

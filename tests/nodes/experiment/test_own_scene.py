@@ -9,9 +9,11 @@ from advnerf_core.documents import read_json
 from hardware.worlds.world import WorldError
 from nodes.experiment.node.search import run_attack
 from nodes.experiment.run.whole import run_experiment
+from nodes.experiment.steps import bake
 from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
+from nodes.experiment.steps.shared_search import search_key
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.tiny_request import loaded, tiny_request
 
@@ -53,6 +55,20 @@ def test_cells_depend_on_what_files_hold_and_not_on_where_they_lie(tmp_path):
     assert keys(tmp_path / "b") == before
     assert not set(keys(tmp_path / "b", "objects=[{name: a, kind: panel, x_m: 1, y_m: -1}]")) & set(before)
     assert not set(keys(tmp_path / "b", "world.speed_mps=0.7")) & set(before)
+
+
+def test_searches_and_cells_of_another_baking_are_not_gone_on_with(tmp_path, monkeypatch):
+    from nodes.experiment.show.victims import look_at_given
+
+    experiment = load_experiment(tiny_request(tmp_path), None, CHANGES, tmp_path / "run")
+    look_at_given(experiment)
+    found = [cell for cell in experiment.cells if cell.searched]
+    before = [(settings_hash(experiment, cell), search_key(experiment, cell)) for cell in found]
+    monkeypatch.setattr(bake, "OWN_VERSION", bake.OWN_VERSION - 1)
+    after = [(settings_hash(experiment, cell), search_key(experiment, cell)) for cell in found]
+    assert len(found) == 2
+    for (cell, search), (other_cell, other_search) in zip(before, after, strict=True):
+        assert (cell != other_cell, search != other_search) == (True, True)
 
 
 def test_a_start_outside_the_learned_box_is_refused(tmp_path):
