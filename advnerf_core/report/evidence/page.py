@@ -315,15 +315,17 @@ def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _place_claim(row: Mapping[str, Any]) -> str:
-    """A claim about a kind of place: one sentence, and what it is the mean of."""
-    title = f"**{row['name']}**, {style_of(row['method']).title} minus the strongest baseline, {row['places']} places and {row['victims']} victims"
+    """A claim about a kind of place or victim: one sentence, and what it is the mean of."""
+    places = row["places"]
+    where = f"{places} places and " * (places > 1)
+    title = f"**{row['name']}**, {style_of(row['method']).title} minus the strongest baseline, {where}{row['victims']} victims"
     if row["difference_m"] is None:
         return f"{title}: no claim, as {row['reason']}.\n"
     low = row["low_off_track_points"]
     said = (
-        f"{title}: {row['difference_m']:+.3f} m per tick ({ends(row['low_m'], row['high_m'])} for new places and victims), off track "
+        f"{title}: {row['difference_m']:+.3f} m per tick ({ends(row['low_m'], row['high_m'])} for new {'places and ' * (places > 1)}victims), off track "
         f"{row['off_track_points']:+.0f} points ({'no bound, as all are equal' if low is None else f'lower bound {low:+.0f}'}), "
-        f"at least {row['least_off_track_points']:+.0f} at each place.\n"
+        f"at least {row['least_off_track_points']:+.0f} {'at each place' if places > 1 else 'for each victim'}.\n"
     )
     return f"{said}\n" + _lines(
         [

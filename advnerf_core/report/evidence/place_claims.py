@@ -1,4 +1,4 @@
-"""Registered claims about a kind of place: places and victims are sampled, and the interval is over both.
+"""Registered claims about a kind of place: places and victims are sampled, and the interval is over both; at one place, over victims.
 
 Searches of one method against one victim at one place mostly find the same optimum, so that many of them say how well the
 optimiser repeats itself, not what happens at the next place. Here they are nested: a place and a victim give one value each,
@@ -44,7 +44,7 @@ class PlaceClaimRow:
 
     Attributes:
         difference_m: Mean difference of the excess |CTE| per tick, deployed [m]; None if it cannot be made.
-        low_m: Lower end of its interval over new places and new victims [m].
+        low_m: Lower end of its interval over new places, if there are several, and new victims [m].
         high_m: Upper end [m].
         off_track_points: Mean difference of the shares of drives off the track [percentage points].
         low_off_track_points: Lower end of its interval over new places and new victims, at least -100; None if all are equal, as values
@@ -95,8 +95,8 @@ def place_claim_row(evidence: Evidence, claim: PlaceClaim) -> PlaceClaimRow:
     interval, of_points = (
         clustered_interval(list(values), evidence.registration.level) for values in (values_m, points)
     )
-    assert interval is not None, "a claim has several places and victims"
-    assert of_points is not None, "a claim has several places and victims"
+    assert interval is not None, "a claim has several victims"
+    assert of_points is not None, "a claim has several victims"
     return PlaceClaimRow(
         claim.name,
         claim.method,

@@ -24,6 +24,8 @@ FORMAT: Literal["advnerf-registration-1"] = "advnerf-registration-1"
 FILE, WITHDRAWN = "set/registration.json", "set/withdrawn.json"
 Pose = tuple[float, float, float]
 Share = Annotated[float, Field(gt=0, lt=1)]
+# Of a claim over places; of one over victims at one place, where fewer say little about the next victim.
+_FEWEST_PLACES, _FEWEST_VICTIMS = 4, 5
 
 
 class SetError(AdvnerfError, ValueError):
@@ -130,16 +132,16 @@ class Contrast(StrictModel):
 
 
 class PlaceClaim(StrictModel):
-    """A claim about a kind of place: a method's deployed effect against that of the baseline that is strongest in the surrogate.
+    """A claim about a kind of place or of victim: a method's deployed effect against that of the baseline that is strongest in the surrogate.
 
     Attributes:
         name: What is claimed about, for readers.
-        scenarios: The places, drawn by a rule before any attack.
-        victims: Victims of one recipe, each of which was driven at all places.
+        scenarios: The places, drawn by a rule before any attack: four or more; or one, for a claim about victims, five or more.
+        victims: The victims, each of which was driven at all places; of one recipe if the claim is about places.
     """
 
     name: str = Field(min_length=1)
-    scenarios: tuple[str, ...] = Field(min_length=4)
+    scenarios: tuple[str, ...] = Field(min_length=1)
     victims: tuple[str, ...] = Field(min_length=2)
     method: str = "gradient"
     against: tuple[str, ...] = Field(min_length=1)
@@ -150,6 +152,15 @@ class PlaceClaim(StrictModel):
         if len(set(names)) < len(names):
             raise ValueError(f"expected different ones, got {', '.join(names)}")
         return names
+
+    @model_validator(mode="after")
+    def _samples_enough(self) -> PlaceClaim:
+        places, victims = len(self.scenarios), len(self.victims)
+        if places < _FEWEST_PLACES and not (places == 1 and victims >= _FEWEST_VICTIMS):
+            raise ValueError(
+                f"expected {_FEWEST_PLACES} scenarios or more, or one and {_FEWEST_VICTIMS} victims or more, got {places} and {victims}"
+            )
+        return self
 
 
 class Registration(StrictModel):

@@ -124,7 +124,8 @@ class ExperimentConfig(StrictModel):
     )
     claims: tuple[PlaceClaim, ...] = Field(
         default=(),
-        description="What is claimed about a kind of place, from at least four of them (variants or paths) and two victims.",
+        description="What is claimed about a kind of place, from at least four of them (variants or paths) and two victims; or of victim, "
+        "from at least five at one place.",
     )
     run_folder: Path | None = Field(
         default=None,

@@ -29,14 +29,14 @@ def replace(cell: CellResult, **values: Any) -> CellResult:
     return cell.model_copy(update=values)
 
 
-def at_places(folder: Any, without_effect: set[tuple[str, str]]) -> Evidence:
+def at_places(folder: Any, without_effect: set[tuple[str, str]], claim: PlaceClaim = CLAIM) -> Evidence:
     """The drives of one set at four places, of two victims; the gradient does nothing in some: there it drives as random textures."""
     registration = read_registration(folder)
     assert registration is not None
     cells = {cell.name: cell for cell in read_cells(folder) if cell.key[:3] == ("track", "", "hardened")}
     made, named = [], []
-    for place in PLACES:
-        for victim in VICTIMS:
+    for place in claim.scenarios:
+        for victim in claim.victims:
             for cell in cells.values():
                 weak = (place, victim) in without_effect and cell.method == "gradient"
                 kept = cells[cell.name.replace("gradient", "random")].kept if weak else cell.kept
@@ -46,10 +46,10 @@ def at_places(folder: Any, without_effect: set[tuple[str, str]]) -> Evidence:
                 )
     registered = registration.model_copy(
         update={
-            "scenarios": dict.fromkeys(PLACES, registration.scenarios["track"]),
+            "scenarios": dict.fromkeys(claim.scenarios, registration.scenarios["track"]),
             "cells": tuple(named),
             "primary": (),
-            "claims": (CLAIM,),
+            "claims": (claim,),
         }
     )
     return Evidence(registered, [replace(cell, registration=registered.digest) for cell in made])
@@ -89,6 +89,22 @@ def test_the_interval_is_over_places_and_victims(folder: Any) -> None:
         round(row.low_off_track_points or 0.0),
     )
     assert (difference.met, bound.met) == (row.off_track_points >= 50.0, False)
+
+
+def test_at_one_place_the_interval_is_over_victims(folder: Any) -> None:
+    victims = tuple("abcdef")
+    claim = PlaceClaim(name="six victims", scenarios=("one",), victims=victims, against=("random",))
+    evidence = at_places(folder, {("one", victim) for victim in victims[:3]}, claim)
+    row = place_claim_row(evidence, claim)
+    full_m = row.each[-1]["difference_m"]
+    values = np.repeat([0.0, full_m], 3)  # symmetric: Student's interval of six values
+    half = stdtrit(5, 0.975) * values.std(ddof=1) / np.sqrt(6.0)
+    assert (row.low_m, row.high_m) == pytest.approx((values.mean() - half, values.mean() + half))
+    data = as_data(evidence) | place_claim_data(evidence)
+    registered = {**evidence.registration.as_filed().model_dump(mode="json"), "digest": "d" * 64}
+    page = results_page({"simulated": {**data, "registered": registered, "filmed": False, "notes": []}})
+    assert "minus the strongest baseline, 6 victims: +" in page
+    assert "for new victims)" in page
 
 
 def test_equal_shares_of_drives_have_a_mean_and_no_bound(folder: Any) -> None:
@@ -139,7 +155,13 @@ def test_registrations_without_claims_keep_their_digest(folder: Any) -> None:
     claimed = registration.model_copy(update={"claims": (CLAIM,)})
     assert claimed.as_filed().digest != registration.digest
     assert Registration.model_validate(claimed.model_dump(mode="json")).claims == (CLAIM,)
-    with pytest.raises(ValueError, match="at least 4 items"):
-        PlaceClaim(name="x", scenarios=("a", "b"), victims=VICTIMS, against=("random",))
+    for places, victims in (
+        (("a", "b"), VICTIMS),
+        (("a",), ("p", "q", "r", "s")),
+        (("a", "b"), tuple("pqrst")),
+    ):
+        told = f"expected 4 scenarios or more, or one and 5 victims or more, got {len(places)} and {len(victims)}"
+        with pytest.raises(ValueError, match=told):
+            PlaceClaim(name="x", scenarios=places, victims=victims, against=("random",))
     with pytest.raises(ValueError, match="expected different ones, got a, a, a, a"):
         PlaceClaim(name="x", scenarios=("a",) * 4, victims=VICTIMS, against=("random",))

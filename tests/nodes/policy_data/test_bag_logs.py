@@ -75,7 +75,7 @@ def test_a_bag_is_one_in_capital_letters_too(tmp_path):
     assert open_log(copied).count == COUNT
 
 
-@pytest.mark.parametrize("labels, codec", [("recorded", "libx264rgb"), ("expert", "libvpx-vp9")])
+@pytest.mark.parametrize(("labels", "codec"), [("recorded", "libx264rgb"), ("expert", "libvpx-vp9")])
 def test_a_bag_that_was_exported_gives_the_same_frames(tmp_path, monkeypatch, labels, codec):
     pytest.importorskip("pyarrow")
     av = pytest.importorskip("av")
