@@ -48,8 +48,8 @@ def ledger_rows(names: str) -> list[LedgerRow]:
         return [row for claim in claims for row in place_rows(name, claim)]
     test = data["primary"][-1]
     registration = read_registration(PUBLISHED / name)
-    scenario = registration.scenario(test["test"]["scenario"]) if registration else None
-    assert scenario is not None, "a primary test is of a registered scenario"
+    assert registration is not None, "a published set is registered"
+    scenario = registration.scenarios[test["test"]["scenario"]]
     rows = [*gap_rows(name, test, data["rows"], scenario.off_track_m), luck_row(name, test)]
     return [*rows, *largest_loss_rows(name, test, data.get("contrasts", []))]
 

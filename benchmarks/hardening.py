@@ -68,7 +68,7 @@ def _judge(run: Path, victim: str, textures: int) -> None:
 
 def _record_published(name: str, found: Strongest) -> None:
     victim = "" if found.victim == HARDENED else found.victim
-    place = " ".join(filter(None, (found.scenario, found.placement, victim))).replace("_", " ")
+    place = f"{found.scenario} {victim}".strip().replace("_", " ")
     for domain, reached in (("learned scene", found.surrogate), ("deployed", found.deployed)):
         print(f"{name}, {place}, {domain}: {found.how}: {reached.text}")
         record_row(

@@ -55,7 +55,6 @@ class Strongest:
 
     Attributes:
         scenario: Name of the scenario.
-        placement: Name of the placement.
         victim: Name of the victim.
         method: The method.
         searches: Number of searches.
@@ -66,7 +65,6 @@ class Strongest:
     """
 
     scenario: str
-    placement: str
     victim: str
     method: str
     searches: int
@@ -96,13 +94,13 @@ def strongest_random(folder: Path) -> list[Strongest]:
     wanted = {*RANDOM_FAMILIES, *COARSE_SEARCHES, *CONTROLS}
     cells = [cell for file in sorted(folder.glob("*.json")) if (cell := read_cell(file)).method in wanted]
     evidence = Evidence(registration, cells)
-    by_place: defaultdict[tuple[str, str, str], list[CellResult]] = defaultdict(list)
+    by_place: defaultdict[tuple[str, str], list[CellResult]] = defaultdict(list)
     for cell in evidence.cells.values():
         searched = cell.victim != NAIVE and cell.method not in CONTROLS
         if evidence.scenario_of(cell).space.get("kind") in RANDOM_ALONE:
             continue  # random places or shapes, no textures
         if searched and cell.kept.get("deployed") and evidence.without(cell):
-            by_place[cell.scenario, cell.placement, cell.victim].append(cell)
+            by_place[cell.scenario, cell.victim].append(cell)
     last = {frozenset(each.attack_id for each in searches): searches for searches in by_place.values()}
     found = [
         [_of_method(evidence, key) for key in dict.fromkeys(each.key for each in searches)]

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import betaincinv, ndtri, stdtrit
 
 from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.evidence.rows import Key
 
 Floats = NDArray[np.float64]
 PRIOR_SPREAD, PRIOR_RESIDUAL = float(np.log(1.5)), 0.1
@@ -134,7 +135,7 @@ def transfer_of(evidence: Evidence, baseline: bool = False) -> Transfer | None:
         found = [
             made
             for method in (test.against if baseline else (test.method,))
-            if (made := _transfer(evidence, (test.scenario, test.placement, test.victim, method))) is not None
+            if (made := _transfer(evidence, (test.scenario, test.victim, method))) is not None
         ]
         if found:
             return max(found, key=lambda each: float(each.surrogate.mean()))
@@ -185,7 +186,7 @@ def binomial_interval(held: int, count: int, level: float = 0.95) -> tuple[float
     return low, high
 
 
-def _transfer(evidence: Evidence, key: tuple[str, str, str, str]) -> Transfer | None:
+def _transfer(evidence: Evidence, key: Key) -> Transfer | None:
     cells = [cell for cell in evidence.searches(key) if cell.kept.get("deployed")]
     if not cells:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
@@ -58,7 +58,7 @@ class CellResult(StrictModel):
         victim: ``hardened``, ``naive`` or ``retrained``.
         method: ``none``, or the name of the method of attack.
         seed: Seed of starts and search.
-        placement: Name of the placement; empty for the scenario's own.
+        placement: Empty; in the files of sets from when the places of objects had names.
         attack_id: Id of the attack file; None for none.
         settings_hash: Hash of everything that the result depends on.
         settings: All of these settings, including defaults; empty in cells from before they were stored.
@@ -81,7 +81,7 @@ class CellResult(StrictModel):
     victim: str = Field(min_length=1)
     method: str = Field(min_length=1)
     seed: int
-    placement: str = ""
+    placement: Literal[""] = ""
     attack_id: str | None = None
     settings_hash: str
     settings: dict[str, Any] = Field(default_factory=dict)
@@ -106,12 +106,12 @@ class CellResult(StrictModel):
     @property
     def name(self) -> str:
         """Name of the cell and of its file."""
-        return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
+        return cell_name(self.scenario, self.victim, self.method, self.seed)
 
     @property
-    def key(self) -> tuple[str, str, str, str]:
-        """Scenario, placement, victim and method: the cells of a table row, over seeds."""
-        return self.scenario, self.placement, self.victim, self.method
+    def key(self) -> tuple[str, str, str]:
+        """Scenario, victim and method: the cells of a table row, over seeds."""
+        return self.scenario, self.victim, self.method
 
     @property
     def ticks(self) -> int:
@@ -132,10 +132,9 @@ class CellResult(StrictModel):
         return [None if tick is None else "obstacle" for tick in ticks]
 
 
-def cell_name(scenario: str, victim: str, method: str, seed: int, placement: str = "") -> str:
-    """Name of a cell, e.g. ``straight_hardened_gradient_0`` or ``straight.near_hardened_gradient_0``."""
-    where = f"{scenario}.{placement}" if placement else scenario
-    return f"{where}_{victim}_{method}_{seed}"
+def cell_name(scenario: str, victim: str, method: str, seed: int) -> str:
+    """Name of a cell, e.g. ``straight_hardened_gradient_0``."""
+    return f"{scenario}_{victim}_{method}_{seed}"
 
 
 def cell_from(data: Any, source: str) -> CellResult:

@@ -72,13 +72,14 @@ def text_table(table: ResultTable) -> Table:
     cells, groups, classes = [], [], []
     last: TableRow | None = None
     for index, row in enumerate(table.rows):
-        new_scenario = last is None or row.key[:2] != last.key[:2]
-        new_victim = last is None or row.key[:3] != last.key[:3]
+        new_scenario = last is None or row.scenario != last.scenario
+        new_victim = last is None or row.key[:2] != last.key[:2]
         if new_victim:
             groups.append(index)
-        where = f"{row.scenario}, {row.placement}" if row.placement else row.scenario
         name = style_of(row.method).title if row.domain == "surrogate" else ""
-        cells.append((where if new_scenario else "", row.victim if new_victim else "", name, *_numbers(row)))
+        cells.append(
+            (row.scenario if new_scenario else "", row.victim if new_victim else "", name, *_numbers(row))
+        )
         classes.append(row.method if row.seeds else "unmeasured")
         last = row
     for at, name in enumerate(_COLUMNS):
@@ -118,7 +119,7 @@ def _numbers(row: TableRow) -> tuple[str, ...]:
 def ratios(table: ResultTable) -> str:
     """Total CTE of each line over that past the plain object, as publications in other units give it; empty without any."""
     rows = [row for row in table.rows if row.ratio is not None and row.method != NONE]
-    named = [", ".join(filter(None, (*row.key[:3], style_of(row.method).title))) for row in rows]
+    named = [", ".join((*row.key[:2], style_of(row.method).title)) for row in rows]
     return "; ".join(
         f"{name}, {DOMAIN_TITLES[row.domain]}: {row.ratio:.2f} ×"
         for name, row in zip(named, rows, strict=True)

@@ -66,8 +66,8 @@ class ResultTable:
     name: str = ""
 
     def find(self, scenario: str, victim: str, method: str, domain: Domain) -> TableRow | None:
-        """One line of no placement; None if it was not requested."""
-        key = (scenario, "", victim, method)
+        """One line; None if it was not requested."""
+        key = (scenario, victim, method)
         return next((row for row in self.rows if row.key == key and row.domain == domain), None)
 
 

@@ -33,7 +33,7 @@ def a_strange_cell(world: World) -> None:
     """A search that was not registered and says that it was."""
     file, data = world.some_search()
     data |= {"seed": 99, "attack_id": f"{world.rng.getrandbits(48):012x}"}
-    name = cell_name(data["scenario"], data["victim"], data["method"], 99, data.get("placement", ""))
+    name = cell_name(data["scenario"], data["victim"], data["method"], 99)
     data["extra"].pop("clip", None)
     world.put(file.with_name(f"{name}.json"), data)
     world.renew_all()
@@ -86,7 +86,7 @@ def stronger_drives(world: World) -> None:
     factor = world.rng.uniform(1.05, 1.3)
     for file in sorted(world.folder.glob("*_gradient_*.json")):
         data = read_json(file)
-        name = cell_name(data["scenario"], data["victim"], "none", 0, data.get("placement", ""))
+        name = cell_name(data["scenario"], data["victim"], "none", 0)
         clean = read_json(world.folder / f"{name}.json")
         for number in range(len(data["kept"]["deployed"])):
             attacked, other = (poses_of(each, "deployed", number) for each in (data, clean))
@@ -98,7 +98,7 @@ def stronger_drives(world: World) -> None:
 def a_copied_drive(world: World) -> None:
     """The drive of another search, from the same start."""
     file, data = world.some_search()
-    wanted = ("scenario", "placement", "victim")
+    wanted = ("scenario", "victim")
     _, other = world.some_cell(
         lambda each: (
             is_searched(each)
@@ -116,7 +116,7 @@ def a_copied_drive(world: World) -> None:
 def swapped_seeds(world: World) -> None:
     """Two searches of one method under one condition change seeds."""
     file, data = world.some_search()
-    wanted = ("scenario", "placement", "victim", "method")
+    wanted = ("scenario", "victim", "method")
     other_file, other = world.some_cell(
         lambda each: each["seed"] != data["seed"] and all(each.get(key) == data.get(key) for key in wanted)
     )

@@ -88,17 +88,14 @@ def write_maps(evidence: Evidence, maps: Sequence[Sequence[Mapping[str, Any]]], 
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor="white")
         for number, shown in enumerate(maps):
-            scenario, placement, *_ = _key(shown[0])
+            scenario = shown[0]["test"]["scenario"]
             groups = groups_of_drives(evidence, shown)
-            registered = evidence.registration.scenario(scenario, placement)
-            assert registered is not None, "the test was registered"
+            registered = evidence.registration.scenarios[scenario]
             share = (1.0 - _LEFT) / len(maps)
             left, width = _LEFT + (number + _MARGIN) * share, (1.0 - 1.2 * _MARGIN) * share
             ax = figure.add_axes((left, 0.36, width, 0.46))
             _draw_map(ax, groups, registered.reference_path(), registered.off_track_m, None)
-            ax.set_title(
-                " ".join(filter(None, (scenario, placement))).replace("_", " "), pad=20 * len(groups)
-            )
+            ax.set_title(scenario.replace("_", " "), pad=20 * len(groups))
             ax.legend(handles=_handles(groups), loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
             below = figure.add_axes((left, 0.085, width, 0.15))
             _draw_deviation(below, groups, registered.off_track_m, registered.dt_s)
@@ -122,10 +119,8 @@ def write_above(
 
     Both are primary tests from ``set.json``. Without the position of the object, or without a film, the picture lacks these.
     """
-    scenario, placement, *_ = _key(shown)
     groups = groups_of_drives(evidence, [shown])
-    registered = evidence.registration.scenario(scenario, placement)
-    assert registered is not None, "the test was registered"
+    registered = evidence.registration.scenarios[shown["test"]["scenario"]]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor="white")
         _draw_map(figure.add_axes(_MAP), groups, registered.reference_path(), registered.off_track_m, place)
@@ -150,19 +145,19 @@ def groups_of_drives(evidence: Evidence, shown: Sequence[Mapping[str, Any]]) -> 
     """Drives past the plain object, the strongest baseline, where there is one, and the attack, of all victims."""
     keys = [_key(each) for each in shown]
     # Fixed colours of different lightness, for any method.
-    plain = _group(evidence, style_of(NONE).title, LIGHT[NONE], [(*key[:3], NONE) for key in keys])
-    attack = _group(evidence, style_of(keys[0][3]).title, LIGHT["gradient"], keys)
+    plain = _group(evidence, style_of(NONE).title, LIGHT[NONE], [(*key[:2], NONE) for key in keys])
+    attack = _group(evidence, style_of(keys[0][2]).title, LIGHT["gradient"], keys)
     baselines = [str(each["baseline"]) for each in shown if each["baseline"]]
     if not baselines:
         return [plain, attack]
     strongest = style_of(baselines[0]).title if len(set(baselines)) == 1 else "strongest baseline"
-    of_baselines = [(*key[:3], baseline) for key, baseline in zip(keys, baselines, strict=True)]
+    of_baselines = [(*key[:2], baseline) for key, baseline in zip(keys, baselines, strict=True)]
     return [plain, _group(evidence, strongest, LIGHT["random"], of_baselines), attack]
 
 
 def _key(shown: Mapping[str, Any]) -> Key:
     test = shown["test"]
-    return test["scenario"], test["placement"], test["victim"], test["method"]
+    return test["scenario"], test["victim"], test["method"]
 
 
 def _group(evidence: Evidence, title: str, colour: str, keys: Sequence[Key]) -> DriveGroup:

@@ -71,7 +71,7 @@ def contrast_data(evidence: Evidence) -> dict[str, Any]:
 
 def _row(evidence: Evidence, contrast: Contrast, victim: str, method: str) -> ContrastRow | None:
     before, after = (
-        {cell.seed: cell for cell in evidence.searches((scenario, "", victim, method))}
+        {cell.seed: cell for cell in evidence.searches((scenario, victim, method))}
         for scenario in (contrast.before, contrast.after)
     )
     found = [(before[seed], after[seed]) for seed in sorted(before.keys() & after.keys())]

@@ -55,9 +55,7 @@ def families_note(registration: Registration) -> list[str]:
 
 
 def _note(registration: Registration, key: str) -> str:
-    tests = [
-        test for test in registration.primary if key in (test.scenario, f"{test.scenario}.{test.placement}")
-    ]
+    tests = [test for test in registration.primary if test.scenario == key]
     if not tests:
         return ""
     against = list(dict.fromkeys(method for test in tests for method in test.against))
@@ -70,9 +68,7 @@ def _note(registration: Registration, key: str) -> str:
 
 
 def _methods(registration: Registration, key: str) -> set[str]:
-    cells = [
-        cell for cell in registration.cells if key in (cell.scenario, f"{cell.scenario}.{cell.placement}")
-    ]
+    cells = [cell for cell in registration.cells if cell.scenario == key]
     return {cell.method for cell in cells if cell.method not in CONTROLS}
 
 

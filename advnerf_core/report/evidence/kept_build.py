@@ -29,7 +29,7 @@ def lost_note(folder: Path) -> list[str]:
 
 def _digests_used(folder: Path, registration: Registration) -> list[str | None]:
     """Digests of scene and victim, of the first cell of every scenario: `verify` checks that the others are equal."""
-    first = {(cell.scenario, cell.placement): cell.name for cell in reversed(registration.cells)}
+    first = {cell.scenario: cell.name for cell in reversed(registration.cells)}
     files = [file for name in first.values() if (file := folder / f"{name}.json").exists()]
     stages = [read_json(file).get("stages", {}) for file in files]
     # A victim with a recipe of its own has a stage of its own, policy-NAME.

@@ -166,8 +166,7 @@ def maps_of(data: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
     maps = dict[str, list[Mapping[str, Any]]]()
     for claimed in data.get("claims", ()):
         for each in claimed["each"]:
-            which = {"scenario": each["scenario"], "victim": each["victim"], "method": claimed["method"]}
-            test = {"placement": "", **which}
+            test = {"scenario": each["scenario"], "victim": each["victim"], "method": claimed["method"]}
             maps.setdefault(each["scenario"], []).append({**each, "test": test})
     return list(maps.values())
 
@@ -181,7 +180,7 @@ def _conditions(data: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """The conditions that contrasts compare, in the form of tests, each with the difference to the one before."""
     found = dict[str, Mapping[str, Any]]()
     for row in data.get("contrasts", ()):
-        of_row = {"placement": "", "victim": row["victim"], "method": row["method"]}
+        of_row = {"victim": row["victim"], "method": row["method"]}
         for end, difference_m in (("before", 0.0), ("after", row["difference_m"])):
             test = {"scenario": row[end], **of_row}
             found.setdefault(row[end], {"test": test, "baseline": None, "difference_m": difference_m})

@@ -126,7 +126,7 @@ def _difference(evidence: Evidence, claim: PlaceClaim, scenario: str, victim: st
     """The values of one place and victim."""
 
     def searches(method: str) -> list[CellResult]:
-        found = evidence.searches((scenario, "", victim, method))
+        found = evidence.searches((scenario, victim, method))
         return [cell for cell in found if evidence.is_registered(cell)]
 
     def excess_m(method: str, domain: Domain) -> float:

@@ -34,7 +34,7 @@ def _drives(evidence: Evidence, shown: list[Row], titles: Mapping[str, str]) -> 
         ax.axhline(0.0, color=LIGHT["tape"], lw=1.0, zorder=1)
         for place, row in enumerate(shown):
             style, filled = style_of(row.method), row.domain == "deployed"
-            cells = evidence.searches((row.scenario, row.placement, row.victim, row.method))
+            cells = evidence.searches(row.key)
             across = np.linspace(-0.28, 0.16, len(cells)) if len(cells) > 1 else [0.0]
             for x, cell in zip(across, cells, strict=True):
                 values = evidence.excesses_m(cell, row.domain)
@@ -44,7 +44,7 @@ def _drives(evidence: Evidence, shown: list[Row], titles: Mapping[str, str]) -> 
                 error = [[row.excess_m - row.low_m], [row.high_m - row.excess_m]]
                 ax.errorbar(place + 0.3, row.excess_m, error, fmt="_", color=LIGHT["ink"], ms=7, capsize=3)
         names = [
-            f"{style_of(row.method).title}\n{DOMAIN_TITLES[row.domain]}\n{' '.join(filter(None, (row.scenario, row.placement)))},"
+            f"{style_of(row.method).title}\n{DOMAIN_TITLES[row.domain]}\n{row.scenario},"
             f"\n{titles.get(row.victim, row.victim)}"
             for row in shown
         ]
@@ -56,14 +56,14 @@ def _drives(evidence: Evidence, shown: list[Row], titles: Mapping[str, str]) -> 
 
 def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
     """Means with their intervals: deployed ones filled, surrogate ones hollow."""
-    places = list(dict.fromkeys((row.scenario, row.placement, row.victim) for row in shown))
+    places = list(dict.fromkeys(row.key[:2] for row in shown))
     methods = list(dict.fromkeys(row.method for row in shown))
     apart = min(0.22, 0.85 / len(methods))
     with new_axes(7.2, 0.9 + max(0.42, 0.14 * len(methods)) * len(places)) as ax:
         ax.axvline(0.0, color=LIGHT["tape"], lw=1.0, zorder=1)
         for row in shown:
             style, filled = style_of(row.method), row.domain == "deployed"
-            down = float(places.index((row.scenario, row.placement, row.victim)))
+            down = float(places.index(row.key[:2]))
             aside = methods.index(row.method) - 0.5 * (len(methods) - 1)
             down += apart * (aside + (_DOMAINS_APART if filled else -_DOMAINS_APART))
             if row.low_m is not None and row.high_m is not None:
@@ -80,7 +80,7 @@ def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
         # The widest legend has the titles of coarse methods in all columns.
         spacing = {"columnspacing": 0.8, "handletextpad": 0.4} if len(entries) > 12 else {}
         ax.figure.legend(entries.values(), entries.keys(), loc="outside upper left", ncols=3, **spacing)
-        names = [f"{' '.join(filter(None, place[:2]))}, {titles.get(place[2], place[2])}" for place in places]
+        names = [f"{scenario}, {titles.get(victim, victim)}" for scenario, victim in places]
         ax.set_yticks(range(len(places)), [name.replace("_", " ") for name in names])
         ax.set(xlabel="excess |CTE| per tick over the plain object [m]", ylim=(len(places) - 0.5, -0.5))
         ax.grid(axis="y", visible=False)

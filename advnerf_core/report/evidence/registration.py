@@ -33,7 +33,7 @@ class SetError(AdvnerfError, ValueError):
 
 
 class RegisteredScenario(StrictModel):
-    """One scenario, or one placement of its objects.
+    """One scenario.
 
     Attributes:
         settings_sha256: Hash of the world and of all settings that a result depends on.
@@ -85,10 +85,10 @@ class RegisteredScenario(StrictModel):
 
 
 class RegisteredCell(StrictModel):
-    """One cell; the placement is empty for the scenario's own, and the method may be ``none``."""
+    """One cell; the method may be ``none``. The placement is in files from when the places of objects had names."""
 
     scenario: str
-    placement: str = ""
+    placement: Literal[""] = ""
     victim: str
     method: str
     seed: int
@@ -96,14 +96,14 @@ class RegisteredCell(StrictModel):
     @property
     def name(self) -> str:
         """Name of the cell, and of its file."""
-        return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
+        return cell_name(self.scenario, self.victim, self.method, self.seed)
 
 
 class PrimaryTest(StrictModel):
     """A claimed test: the method's deployed excess against that of the baseline, one of ``against``, that is strongest in the surrogate."""
 
     scenario: str
-    placement: str = ""
+    placement: Literal[""] = Field(default="", description="As in `RegisteredCell`.")
     victim: str
     method: str
     against: tuple[str, ...] = Field(min_length=1)
@@ -192,10 +192,6 @@ class Registration(StrictModel):
     level: Share = 0.95
     alpha: Share = 0.05
 
-    def scenario(self, name: str, placement: str = "") -> RegisteredScenario | None:
-        """A scenario; None if it is not registered."""
-        return self.scenarios.get(scenario_key(name, placement))
-
     def as_filed(self) -> Registration:
         """The registration as `read_registration` would read it from its file, with explicit defaults."""
         return Registration.model_validate(self.model_dump(mode="json"))
@@ -211,11 +207,6 @@ class Registration(StrictModel):
 def launch_file(text: str) -> str:
     """A registered file, or a recorded command, with the file's current name: registrations and rows keep the old one."""
     return text.replace(".campaign.yaml", ".experiment.yaml")
-
-
-def scenario_key(name: str, placement: str) -> str:
-    """Name of a scenario with a placement in a registration."""
-    return f"{name}.{placement}" if placement else name
 
 
 def settings_differences(

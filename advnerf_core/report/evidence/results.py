@@ -21,7 +21,6 @@ from advnerf_core.report.evidence.registration import (
     RegisteredScenario,
     Registration,
     require_registration,
-    scenario_key,
 )
 from advnerf_core.report.evidence.rows import CellDrives, Key, Outcome, Row, make_row
 from advnerf_core.report.reference import DOMAINS, Domain
@@ -90,9 +89,7 @@ class Evidence(CellDrives):
         super().__init__(
             cell
             for cell in cells
-            if cell.kept
-            and not cell.not_driven_live
-            and registration.scenario(cell.scenario, cell.placement) is not None
+            if cell.kept and not cell.not_driven_live and cell.scenario in registration.scenarios
         )
         self.all_cells = tuple(cells)
         self.registration, self.level = registration, registration.level
@@ -102,9 +99,7 @@ class Evidence(CellDrives):
 
     def scenario_of(self, cell: CellResult) -> RegisteredScenario:
         """The registered scenario of a cell."""
-        found = self.registration.scenario(cell.scenario, cell.placement)
-        assert found is not None, "cells of other scenarios were left out"
-        return found
+        return self.registration.scenarios[cell.scenario]
 
     def is_registered(self, cell: CellResult) -> bool:
         """Whether a cell was registered, and run under this registration."""
@@ -115,7 +110,7 @@ class Evidence(CellDrives):
         key = cell.name, domain
         if key not in self._metrics:
             path, horizon = (
-                self._paths[scenario_key(cell.scenario, cell.placement)],
+                self._paths[cell.scenario],
                 self.scenario_of(cell).horizon,
             )
             drives = cell.kept.get(domain, ())
@@ -165,7 +160,7 @@ def rows(evidence: Evidence) -> list[Row]:
     """All rows, in the order of the registration; unregistered ones come last."""
     keys: dict[Key, None] = {}
     for cell in evidence.registration.cells:
-        keys[cell.scenario, cell.placement, cell.victim, cell.method] = None
+        keys[cell.scenario, cell.victim, cell.method] = None
     keys |= dict.fromkeys(cell.key for cell in evidence.cells.values())
     made = [make_row(evidence, key, domain) for key in keys for domain in DOMAINS]
     return sorted((row for row in made if row is not None), key=lambda row: not row.registered)
@@ -189,7 +184,8 @@ def as_data(evidence: Evidence) -> dict[str, Any]:
         "searches": search_list(evidence),
         "rows": [vars(row) for row in rows(evidence)],
         "primary": [
-            {**asdict(test), "test": test.test.model_dump(mode="json")} for test in primary_tests(evidence)
+            {**asdict(test), "test": test.test.model_dump(mode="json", exclude={"placement"})}
+            for test in primary_tests(evidence)
         ],
     }
 
@@ -208,7 +204,7 @@ def search_list(evidence: Evidence) -> list[dict[str, Any]]:
 def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
     """A test whose cells all exist; else None."""
     by_method = {
-        method: evidence.searches((test.scenario, test.placement, test.victim, method))
+        method: evidence.searches((test.scenario, test.victim, method))
         for method in (test.method, *test.against)
     }
     if not all(cells and all(evidence.is_registered(cell) for cell in cells) for cells in by_method.values()):

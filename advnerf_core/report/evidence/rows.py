@@ -14,7 +14,7 @@ from advnerf_core.report.conditions import EMPTY, NONE
 from advnerf_core.report.evidence.intervals import LEVEL, ClusteredInterval, clustered_interval
 from advnerf_core.report.reference import Domain
 
-Key = tuple[str, str, str, str]  # scenario, placement, victim, method
+Key = tuple[str, str, str]  # scenario, victim, method
 
 
 @dataclass(frozen=True)
@@ -22,15 +22,14 @@ class RowOf:
     """What a row is of: a method, or ``none``, against a victim in one domain."""
 
     scenario: str
-    placement: str
     victim: str
     method: str
     domain: Domain
 
     @property
     def key(self) -> Key:
-        """Scenario, placement, victim and method."""
-        return self.scenario, self.placement, self.victim, self.method
+        """Scenario, victim and method."""
+        return self.scenario, self.victim, self.method
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ class CellDrives:
 
     def without(self, cell: CellResult, control: str = NONE) -> CellResult | None:
         """The cell of the same drives with a control: the plain object (``none``) or no object (``empty``)."""
-        return self.cells.get(cell_name(cell.scenario, cell.victim, control, 0, cell.placement))
+        return self.cells.get(cell_name(cell.scenario, cell.victim, control, 0))
 
     def is_registered(self, cell: CellResult) -> bool:
         """Whether a cell was registered."""

@@ -106,6 +106,6 @@ def _findings(evidence: Evidence, problems: Sequence[str]) -> Iterator[str]:
         return
     for row in drives_badly(evidence):
         yield (
-            f"{row['scenario']} {row['placement']} {row['victim']} does not drive well {row['domain']}: mean |CTE| {row['mean_cte_m']:.4f} m without "
+            f"{row['scenario']} {row['victim']} does not drive well {row['domain']}: mean |CTE| {row['mean_cte_m']:.4f} m without "
             f"attack, at most {row['limit_m']:.4f} m was registered; {row['off_track']} drives off the track"
-        ).replace("  ", " ")
+        )

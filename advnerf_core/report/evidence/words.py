@@ -11,7 +11,7 @@ from advnerf_core.report.reference import Domain
 
 DOMAIN_TITLES: Mapping[Domain, str] = {"surrogate": "learned scene", "deployed": "deployed"}
 NOT_DRIVEN = "not driven"
-_KEY = ("scenario", "placement", "victim", "method")
+_KEY = ("scenario", "victim", "method")
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ def row_of(rows: Sequence[Mapping[str, Any]], test: Mapping[str, Any], domain: D
 
 def place_of(row: Mapping[str, Any]) -> str:
     """Name of a condition for readers."""
-    return f"{row['scenario']} {row['placement']}".strip().replace("_", " ")
+    name: str = row["scenario"]
+    return name.replace("_", " ")
 
 
 def ends(low_m: float | None, high_m: float | None) -> str:

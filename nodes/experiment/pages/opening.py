@@ -13,7 +13,7 @@ from advnerf_core.report.reference import Domain
 from advnerf_core.report.result_table import ResultTable, TableRow
 from advnerf_core.report.text_table import count
 
-Condition = tuple[str, str, str]  # scenario, placement, victim
+Condition = tuple[str, str]  # scenario, victim
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def first_screen(data: ReportData, table: ResultTable, victim: str, wording: Wor
     from advnerf_core.report.plots import svg
 
     driven = data.drives[0]
-    said = opening(table, wording, (driven.scenario, "", victim))
+    said = opening(table, wording, (driven.scenario, victim))
     deployed = bool(driven.select(victim=victim, domain="deployed"))
     domain: Domain = "deployed" if deployed else "surrogate"
     methods = dict.fromkeys(run.condition for run in driven.runs)
@@ -60,7 +60,7 @@ def first_screen(data: ReportData, table: ResultTable, victim: str, wording: Wor
 
 
 def opening(table: ResultTable, wording: Wording, key: Condition | None = None) -> FirstScreen:
-    """The sentences of a table: first the one of a scenario, placement and victim, by default the table's first; the others below it."""
+    """The sentences of a table: first the one of a scenario and victim, by default the table's first; the others below it."""
     found = summaries(table, wording)
     main = key if key in found else next(iter(found), None)
     if main is None:
@@ -70,17 +70,17 @@ def opening(table: ResultTable, wording: Wording, key: Condition | None = None) 
 
 
 def summaries(table: ResultTable, wording: Wording) -> dict[Condition, str]:
-    """A sentence for each scenario, placement and victim of a table."""
-    keys = dict.fromkeys(row.key[:3] for row in table.rows)
+    """A sentence for each scenario and victim of a table."""
+    keys = dict.fromkeys(row.key[:2] for row in table.rows)
     return {
-        key: _sentence({(row.method, row.domain): row for row in table.rows if row.key[:3] == key}, wording)
+        key: _sentence({(row.method, row.domain): row for row in table.rows if row.key[:2] == key}, wording)
         for key in keys
     }
 
 
 def _name_of(key: Condition) -> str:
-    """Readable name of a scenario, placement and victim."""
-    return ", ".join(filter(None, (*key[:2], f"{key[2]} policy"))).replace("_", " ")
+    """Readable name of a scenario and victim."""
+    return f"{key[0]}, {key[1]} policy".replace("_", " ")
 
 
 def _sentence(rows: dict[tuple[str, str], TableRow], wording: Wording) -> str:

@@ -23,13 +23,13 @@ def wanted_rows(cells: Sequence[Cell]) -> dict[Key, list[int]]:
     """The seeds of each line of the cells, in the order in which their paths and variants appear."""
     seeds: dict[Key, list[int]] = {}
     for cell in cells:
-        seeds.setdefault((cell.scenario, "", cell.victim, cell.method), []).append(cell.seed)
-    scenarios = list(dict.fromkeys(scenario for scenario, _, _, _ in seeds))
+        seeds.setdefault((cell.scenario, cell.victim, cell.method), []).append(cell.seed)
+    scenarios = list(dict.fromkeys(scenario for scenario, _, _ in seeds))
     # By victim before method: the reader compares the methods on one victim.
-    victims = list(dict.fromkeys(victim for _, _, victim, _ in seeds))
+    victims = list(dict.fromkeys(victim for _, victim, _ in seeds))
     order = sorted(
         seeds,
-        key=lambda key: (scenarios.index(key[0]), victims.index(key[2]), order_of(key[3])),
+        key=lambda key: (scenarios.index(key[0]), victims.index(key[1]), order_of(key[2])),
     )
     return {key: seeds[key] for key in order}
 

@@ -65,7 +65,7 @@ def registered_under(registration: Registration | None, cell: Cell, settings: Se
     """Digest of the registration of a cell; empty if it is not registered with these settings, its variant's `registered_settings`."""
     if registration is None or registered_cell(cell) not in registration.cells:
         return ""
-    scenario = registration.scenario(cell.scenario)
+    scenario = registration.scenarios.get(cell.scenario)
     same = scenario is not None and scenario.settings_sha256 == settings.key
     return registration.digest if same else ""
 
@@ -84,7 +84,7 @@ def not_registered(experiment: Experiment, cells: Sequence[Cell]) -> str:
     ]
     if not outside:
         return ""
-    scenario = registration.scenario(outside[0].scenario)
+    scenario = registration.scenarios.get(outside[0].scenario)
     now = registered_settings(experiment.of(outside[0])).resolved
     differ = [] if scenario is None else settings_differences(scenario.settings, now)
     why = f": {', '.join(differ[:_MOST_DIFFERENCES])}" if differ else ""

@@ -95,7 +95,7 @@ def unreadable(published: Path, why: str) -> RedriveError:
 def _require_same_drives(variant: Experiment, cell: Cell, published: Path) -> None:
     """Raise if this version would drive differently from the registered drives."""
     registration = read_registration(published)
-    then = None if registration is None else registration.scenario(cell.scenario)
+    then = None if registration is None else registration.scenarios.get(cell.scenario)
     now = registered_scenario(variant, cell.path)
     if differ := [name for name in _DRIVEN if then is not None and getattr(then, name) != getattr(now, name)]:
         raise unreadable(published, f"expected the {', '.join(differ)} that were registered, got others")

@@ -43,7 +43,7 @@ def write_film(experiment: Experiment, published: Path) -> Path | None:
 def _clips(experiment: Experiment, published: Path, test: Mapping[str, Any]) -> list[Path]:
     which, evidence = test["test"], read_evidence(published)
     searched = [
-        evidence.searches((which["scenario"], which["placement"], which["victim"], method))[0]
+        evidence.searches((which["scenario"], which["victim"], method))[0]
         for method in (NONE, test["baseline"], which["method"])
         if method
     ]

@@ -74,7 +74,7 @@ def table(drives, ticks=60, **changes):
     for method, found in parts.items():
         cell = {**known, "method": method, "surrogate": next(iter(found.values())), **found}
         cells.append(CellResult.model_validate(cell))
-    wanted = {("track", "", "hardened", name): (0,) for name in ("none", "random", "gradient")}
+    wanted = {("track", "hardened", name): (0,) for name in ("none", "random", "gradient")}
     return make_table(wanted, cells, "room")
 
 

@@ -69,7 +69,7 @@ def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
 
 
 def excess(evidence: Evidence, method: str, domain: str) -> np.ndarray:
-    cells = evidence.searches(("track", "", "hardened", method))
+    cells = evidence.searches(("track", "hardened", method))
     return np.array([[o.excess_cte_m_per_tick for o in evidence.outcomes(cell, domain)] for cell in cells])
 
 

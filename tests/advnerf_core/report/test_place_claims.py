@@ -33,7 +33,7 @@ def at_places(folder: Any, without_effect: set[tuple[str, str]], claim: PlaceCla
     """The drives of one set at four places, of two victims; the gradient does nothing in some: there it drives as random textures."""
     registration = read_registration(folder)
     assert registration is not None
-    cells = {cell.name: cell for cell in read_cells(folder) if cell.key[:3] == ("track", "", "hardened")}
+    cells = {cell.name: cell for cell in read_cells(folder) if cell.key[:2] == ("track", "hardened")}
     made, named = [], []
     for place in claim.scenarios:
         for victim in claim.victims:
@@ -63,7 +63,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory):
 
 
 def mean_m(evidence: Evidence, method: str) -> float:
-    cells = evidence.searches(("one", "", "other", method))
+    cells = evidence.searches(("one", "other", method))
     return float(np.mean([o.excess_cte_m_per_tick for c in cells for o in evidence.outcomes(c, "deployed")]))
 
 

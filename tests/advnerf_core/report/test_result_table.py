@@ -67,7 +67,7 @@ def cell(scenario, method, seed, surrogate, deployed, clip=None, victim="hardene
     return CellResult.model_validate(data)
 
 
-WANTED = {("straight", "", "hardened", method): (0, 1, 2) for method in ("none", "random", "gradient")}
+WANTED = {("straight", "hardened", method): (0, 1, 2) for method in ("none", "random", "gradient")}
 
 
 @pytest.fixture

@@ -198,7 +198,7 @@ def test_every_victim_has_its_sentence_on_the_first_screen(report, make):
         for victim in ("hardened", "naive")
         for cell in make.table(drives_of(([13.2], [True]))).cells.values()
     ]
-    wanted = {("track", "", victim, name): (0,) for victim in ("hardened", "naive") for name in METHODS}
+    wanted = {("track", victim, name): (0,) for victim in ("hardened", "naive") for name in METHODS}
     first = first_screen(report, make_table(wanted, cells), "naive", LAB)
     assert first.sentence.startswith("In the simulated lab the car left its track")
     assert [name for name, _ in first.more] == ["track, hardened policy"]

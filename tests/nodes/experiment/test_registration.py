@@ -41,7 +41,7 @@ def test_a_registration_says_what_will_be_run(experiment, trained, tmp_path):
     found = register(experiment, experiment.cells, tmp_path)
     assert read_registration(tmp_path / "junction") == found
     assert len(found.cells) == len(experiment.cells)
-    scenario = found.scenario("right")
+    scenario = found.scenarios["right"]
     assert scenario.reference_path().to_dict() == trained.paths["right"].to_dict()
     assert [list(start) for start in scenario.starts] == trained.measured_starts("right").tolist()
     assert scenario.evaluations == trained.config.attack.evaluations
@@ -184,7 +184,7 @@ def test_cells_of_the_registered_settings_are_run_under_it_and_no_others(experim
     found = register(experiment, experiment.cells, tmp_path)
     assert under(cell, trained) == found.digest
     assert under(replace(cell, seed=7), trained) == ""
-    assert found.scenario("right").settings["capture"]["driven_m"] == 36.0  # its defaults are there
+    assert found.scenarios["right"].settings["capture"]["driven_m"] == 36.0  # its defaults are there
     config = trained.config.model_copy(update={"horizon": 2})
     assert under(cell, replace(trained, config=config)) == ""
 

@@ -15,7 +15,7 @@ import numpy as np
 from advnerf_core.documents import read_json
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
-from advnerf_core.report.evidence.registration import read_withdrawn, scenario_key
+from advnerf_core.report.evidence.registration import read_withdrawn
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.evidence.verifying.drives import drive_problems
 from advnerf_core.report.evidence.verifying.layout import cell_files
@@ -82,7 +82,7 @@ def _copies(attacked: list[CellResult]) -> Iterator[str]:
     for cell in attacked:
         for domain, drives in cell.kept.items():
             for number, drive in enumerate(drives):
-                key = (cell.scenario, cell.placement, domain, drive.x_m, drive.y_m)
+                key = (cell.scenario, domain, drive.x_m, drive.y_m)
                 first = seen.setdefault(key, cell)
                 if first is not cell:
                     yield f"{cell.name}, {domain}, start {number}: is the drive of {first.name}"
@@ -129,9 +129,7 @@ def _disagrees(said: Mapping[str, Any], ticks: int) -> Iterator[str]:
 
 def _gate_problems(folder: Path, evidence: Evidence) -> Iterator[str]:
     """Whether each verdict of the fidelity gate belongs to a victim of this set, passed unless it lists a reason, and has possible numbers."""
-    victims = {
-        f"{scenario_key(cell.scenario, cell.placement)}_{cell.victim}" for cell in evidence.cells.values()
-    }
+    victims = {f"{cell.scenario}_{cell.victim}" for cell in evidence.cells.values()}
     verdicts: dict[str, Any] = {}
     for file in sorted(folder.glob("gate/*.json")):
         if file.name.split(".drive.json")[0].removesuffix(".json") not in victims:

@@ -75,23 +75,23 @@ def _not_before(date: str, other: str) -> bool:
 
 def build_problems(evidence: Evidence) -> Iterator[str]:
     """Whether all cells of a scenario have the same stages, and each victim is one policy."""
-    stages: dict[tuple[str, str, str], str] = {}
-    parts: dict[tuple[str, str], set[str]] = {}
-    policies: dict[tuple[str, str, str], str] = {}
+    stages: dict[tuple[str, str], str] = {}
+    parts: dict[str, set[str]] = {}
+    policies: dict[tuple[str, str], str] = {}
     for cell in evidence.cells.values():
-        place = (cell.scenario, cell.placement)
+        place = cell.scenario
         # The stage of a victim with a recipe of its own is policy-NAME.
         part = {name.partition("-")[0] for name in cell.stages}
         if part != parts.setdefault(place, part) or any(
-            digest != stages.setdefault((*place, name), digest) for name, digest in cell.stages.items()
+            digest != stages.setdefault((place, name), digest) for name, digest in cell.stages.items()
         ):
             yield f"{cell.name}: was run with other stages than the cells before it"
-        victim = (*place, cell.victim)
+        victim = (place, cell.victim)
         if cell.policy_sha256 != policies.setdefault(victim, cell.policy_sha256):
             yield f"{cell.name}: was run against another policy than the other cells of this victim"
-    by_place: dict[tuple[str, str], list[str]] = {}
-    for (scenario, placement, _), digest in policies.items():
-        by_place.setdefault((scenario, placement), []).append(digest)
-    for (scenario, placement), found in by_place.items():
+    by_place: dict[str, list[str]] = {}
+    for (scenario, _), digest in policies.items():
+        by_place.setdefault(scenario, []).append(digest)
+    for scenario, found in by_place.items():
         if len(set(found)) != len(found):
-            yield f"{scenario} {placement}: two victims are one policy"
+            yield f"{scenario}: two victims are one policy"

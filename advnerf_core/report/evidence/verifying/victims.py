@@ -14,7 +14,6 @@ from advnerf_core.report.evidence.registration import (
     SetError,
     read_reasons,
     require_registration,
-    scenario_key,
 )
 from advnerf_core.report.evidence.results import Evidence
 from advnerf_core.report.reference import DOMAINS
@@ -39,7 +38,7 @@ def drives_badly(evidence: Evidence) -> list[dict[str, Any]]:
                 sum(d.off_track for d in drives),
             )
             if mean_m > limit_m or off:
-                where = {"scenario": cell.scenario, "placement": cell.placement, "victim": cell.victim}
+                where = {"scenario": cell.scenario, "victim": cell.victim}
                 found.append(
                     {**where, "domain": domain, "mean_cte_m": mean_m, "limit_m": limit_m, "off_track": off}
                 )
@@ -47,8 +46,8 @@ def drives_badly(evidence: Evidence) -> list[dict[str, Any]]:
 
 
 def victim_key(row: Mapping[str, Any]) -> str:
-    """Name of a victim in a declaration, ``SCENARIO.VICTIM`` or ``SCENARIO.PLACEMENT.VICTIM``."""
-    return f"{scenario_key(row['scenario'], row['placement'])}.{row['victim']}"
+    """Name of a victim in a declaration, ``SCENARIO.VICTIM``."""
+    return f"{row['scenario']}.{row['victim']}"
 
 
 def read_declared(folder: Path) -> dict[str, str]:
