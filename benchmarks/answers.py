@@ -20,6 +20,7 @@ from advnerf_core.report.evidence.words import (
     p_text,
     place_of,
     row_of,
+    sample_of,
     smaller_excess,
 )
 from advnerf_core.report.reference import DOMAINS
@@ -161,9 +162,8 @@ def _transfers(sets: Sequence[Mapping[str, Any]], about: Mapping[str, SetAbout])
 def _claimed(sets: Sequence[Mapping[str, Any]]) -> str:
     """What claims over places and victims say, also where the attack does nothing."""
     return "".join(
-        f" Over {claim['places']} places and {claim['victims']} victims of {found['name']} it adds {claim['difference_m']:+.3f} m per tick to the strongest baseline "
-        f"(95 % {ends(claim['low_m'], claim['high_m'])}) and {claim['off_track_points']:+.0f} points to the share of drives "
-        f"off the lane, at {sum(each['off_track_points'] > 0.0 for each in claim['each'])} of {len(claim['each'])}."
+        f" Over {sample_of(claim)} of {found['name']} it adds {claim['difference_m']:+.3f} m to the strongest baseline "
+        f"(95 % {ends(claim['low_m'], claim['high_m'])}) and {claim['off_track_points']:+.0f} points of drives off the track."
         for found in sets
         for claim in found.get("claims", ())
         if claim["difference_m"] is not None

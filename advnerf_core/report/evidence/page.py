@@ -17,6 +17,7 @@ from advnerf_core.report.evidence.words import (
     excess_cells,
     p_text,
     place_of,
+    sample_of,
 )
 from advnerf_core.report.text_table import Table
 
@@ -316,8 +317,9 @@ def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:
 def _place_claim(row: Mapping[str, Any]) -> str:
     """A claim about a kind of place or victim: one sentence, and what it is the mean of."""
     places = row["places"]
-    where = f"{places} places and " * (places > 1)
-    title = f"**{row['name']}**, {style_of(row['method']).title} minus the strongest baseline, {where}{row['victims']} victims"
+    title = (
+        f"**{row['name']}**, {style_of(row['method']).title} minus the strongest baseline, {sample_of(row)}"
+    )
     if row["difference_m"] is None:
         return f"{title}: no claim, as {row['reason']}.\n"
     low = row["low_off_track_points"]

@@ -62,6 +62,11 @@ def place_of(row: Mapping[str, Any]) -> str:
     return name.replace("_", " ")
 
 
+def sample_of(claim: Mapping[str, Any]) -> str:
+    """What the interval of a claim is over, from ``set.json``."""
+    return f"{claim['places']} places and " * (claim["places"] > 1) + f"{claim['victims']} victims"
+
+
 def ends(low_m: float | None, high_m: float | None) -> str:
     """Both ends of an interval; empty without one."""
     return "" if low_m is None or high_m is None else f"{low_m:.3f} to {high_m:.3f}"

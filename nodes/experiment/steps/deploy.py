@@ -28,7 +28,7 @@ from nodes.lab.trials.tries import NotDrivenError
 DRIVES = "drives.json"
 
 
-def _through_world(
+def drive_through_world(
     experiment: Experiment, scene: World, space: Space, cell: Cell, folder: Path
 ) -> list[DeployedDrive]:
     """One drive per start by the open world's own car, tick by tick."""
@@ -164,7 +164,7 @@ def _deployed_part(
         live = _through_nodes(experiment, place, cell, folder, tell)
         drives = [as_drive(experiment, each) for each in live]
     else:
-        drives = _through_world(experiment, place, space, cell, folder)
+        drives = drive_through_world(experiment, place, space, cell, folder)
     data = {
         "states": [drive.states.tolist() for drive in drives],
         "commands": [drive.controls.tolist() for drive in drives],

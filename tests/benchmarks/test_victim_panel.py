@@ -1,0 +1,28 @@
+"""The matrix of a panel of victims, against numbers by hand."""
+
+import numpy as np
+import pytest
+
+from benchmarks.victim_panel import excess_m, off_track, picture, share_kept
+
+
+def drives(totals, off):
+    return [{"total_cte_m": total, "off_track": each} for total, each in zip(totals, off, strict=True)]
+
+
+FOUND = {
+    "victims": ["soft", "stiff"],
+    "ticks": 10,
+    "none": drives([[1.0, 3.0], [2.0, 2.0]], [[False, False]] * 2),
+    "soft": drives([[11.0, 13.0], [4.0, 6.0]], [[True, True], [False, False]]),
+    "stiff": drives([[3.0, 5.0], [5.0, 9.0]], [[False, False], [False, True]]),
+}
+
+
+def test_rows_are_attacked_and_columns_driven_victims():
+    excess = excess_m(FOUND)
+    assert excess == pytest.approx(np.array([[1.0, 0.3], [0.2, 0.5]]))
+    assert off_track(FOUND).tolist() == [[1.0, 0.0], [0.0, 0.5]]
+    assert share_kept(excess) == pytest.approx((0.3 + 0.2) / (1.0 + 0.5))
+    texts = {text.get_text() for text in picture(FOUND["victims"], excess, off_track(FOUND)).axes[0].texts}
+    assert texts == {"1.00\n100 %", "0.30\n0 %", "0.20\n0 %", "0.50\n50 %"}
