@@ -53,6 +53,7 @@ class AttackedObject:
         sha256: Hash of its geometry and fixed colours.
         glb: The attacked mesh as a binary glTF file, in the object's frame; empty for other objects.
         size_m: Width and height of a panel's texture [m]; None for solid objects, for a face (see `AttackFace`), and in older files.
+        marker_m: Side of the markers in the border that it had in the search [m]; None without a border.
     """
 
     name: str
@@ -62,6 +63,7 @@ class AttackedObject:
     sha256: str
     glb: bytes = b""
     size_m: tuple[float, float] | None = None
+    marker_m: float | None = None
 
     @property
     def placement(self) -> tuple[float, float, float, float]:
@@ -248,6 +250,7 @@ def _object_metadata(each: AttackedObject) -> dict[str, Any]:
         "scale": float(each.scale),
         "sha256": each.sha256,
         **({} if each.size_m is None else {"size_m": [float(v) for v in each.size_m]}),
+        **({} if each.marker_m is None else {"marker_m": each.marker_m}),
     }
 
 
@@ -376,6 +379,7 @@ def _from_parts(metadata: dict[str, Any], tensors: dict[str, NDArray[Any]]) -> A
             each["sha256"],
             tensors[f"objects.{k}.glb"].tobytes() if f"objects.{k}.glb" in tensors else b"",
             tuple(each["size_m"]) if "size_m" in each else None,
+            each.get("marker_m"),
         )
         for k, each in enumerate(values["objects"])
     )

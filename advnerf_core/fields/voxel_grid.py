@@ -113,10 +113,12 @@ class VoxelGridObject:
 
     @property
     def face_size_m(self) -> tuple[float, float] | None:
-        """Width and height of its flat texture in the world [m]; None for a solid object."""
+        """Width and height of its flat texture in the world, without a border [m]; None for a solid object."""
         if len(self.theta_shape) != 3:
             return None
-        width_m, height_m = self.scale * (np.asarray(self.box_max) - self.box_min)[1:]
+        textured = self.slots[-1] < self.free_count
+        shares = np.array([textured.any(axis=1).mean(), textured.any(axis=0).mean()])
+        width_m, height_m = shares * self.scale * (np.asarray(self.box_max) - self.box_min)[1:]
         return float(width_m), float(height_m)
 
     @property
@@ -270,6 +272,40 @@ def cube_face_object(
         box_max=np.array([0.0, half, half]),
         T_world_from_object=pose,
         one_sided=one_sided,
+    )
+
+
+def with_border(panel: VoxelGridObject, colours: ArrayLike) -> VoxelGridObject:
+    """A panel of `cube_face_object` with a border of fixed colours around its face.
+
+    Args:
+        colours: Colours of border and face ``[n, n, 3]`` in 0..1, row 0 on top, column 0 left for a viewer, in voxels as large as the face's;
+            the face's part is not used.
+    """
+    drawn = np.asarray(colours, dtype=np.float64)
+    across, rest = divmod(len(drawn) - len(panel.slots[0]), 2)
+    if drawn.shape != (len(drawn), len(drawn), 3) or across < 1 or rest:
+        raise ValueError(
+            f"expected colours [n, n, 3] with a border on every side of {len(panel.slots[0])}, got {drawn.shape}"
+        )
+    around = np.ones(drawn.shape[:2], dtype=bool)
+    around[across:-across, across:-across] = False
+    slots = np.pad(
+        panel.slots, ((0, 0), (across, across), (across, across)), constant_values=panel.free_count
+    )
+    # From rows and columns of a picture to voxels along y and z.
+    seen = np.zeros(around.shape, dtype=np.int32)
+    seen[around] = panel.slot_count + np.arange(around.sum())
+    slots[:, around.T[:, ::-1]] = seen.T[:, ::-1][around.T[:, ::-1]]
+    wider = across * (panel.box_max[1] - panel.box_min[1]) / len(panel.slots[0])
+    grown = np.array([0.0, wider, wider])
+    return replace(
+        panel,
+        slots=slots,
+        fixed_colours=np.concatenate([panel.fixed_colours, drawn[around]]),
+        plain_colours=np.broadcast_to(panel.fixed_colours[0], (panel.free_count, 3)),
+        box_min=panel.box_min - grown,
+        box_max=panel.box_max + grown,
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from advnerf_core.attack.artifact import load_attack, save_attack
 from advnerf_core.attack.printing.poster import poster_of
@@ -32,12 +33,14 @@ from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
 from nodes.experiment.node.printed import record_beside
 from nodes.experiment.node.search import run_attack
+from nodes.experiment.show.own_scene import own_objects
 from nodes.lab.wizards.prints import MeasuredPrint, write_measured
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import encode, image_message, pose_message
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.faces import face_attack
 from tests.support.photographed import before_camera, lens, photograph, scaled
-from tests.support.tiny_request import CALIBRATION, loaded, tiny_request
+from tests.support.tiny_request import CALIBRATION, loaded, tiny_request, with_objects
 
 LENS = lens(960, 720, 750.0)
 START_NS = 1_800_000_000_000_000_000
@@ -239,6 +242,49 @@ def test_a_drive_gives_size_pose_flatness_and_the_effect_where_it_hangs(call, se
     assert effect["at_measured_pose"]
     assert "where it hangs" in said
     assert min(effect[key] for key in ("clean_m", "nominal_m", "print_m")) >= 0.0
+
+
+def test_a_print_has_the_border_that_its_search_had(tmp_path):
+    """The scene's cells are the areas of the printed poster that they stand for."""
+    file = with_objects(
+        tiny_request(tmp_path, evaluations=1),
+        "{name: board, kind: panel, x_m: 1.2, y_m: -1.7, z_m: 0.3, yaw_rad: 3.1, scale: 0.5, face: {resolution: 16, marker_m: 0.12}}",
+    )
+    request = loaded(file)
+    (found,) = run_attack(request, tmp_path / "run", ProgressDisplay())
+    poster = poster_of(load_attack(found)).with_markers()
+    assert poster.size_m == pytest.approx((1.0, 1.0))
+    assert poster.frame.marker_m == pytest.approx(0.12, abs=0.03)
+    (own,) = own_objects(request)
+    field = own.field
+    assert field.scale * (field.box_max - field.box_min)[1:] == pytest.approx(poster.frame.sheet_m)
+    cells = field.slots.shape[1]
+    numbered = replace(
+        poster, frame=replace(poster.frame, first=0)
+    )  # which print it is, is not known in the search
+    picture = numbered.pixels((0.0, 0.0, *poster.sheet_mm), (cells * 40, cells * 40))
+    expected = cv2.resize(picture, (cells, cells), interpolation=cv2.INTER_AREA) / 255.0
+    shown = field.colours(torch.zeros(16, 16, 3)).numpy()[field.slots[-1]][:, ::-1].transpose(1, 0, 2)
+    around = np.ones((cells, cells), bool)
+    around[(cells - 16) // 2 : (cells + 16) // 2, (cells - 16) // 2 : (cells + 16) // 2] = False
+    assert np.abs(shown - expected)[around].max() < 0.12
+    assert np.abs(shown - expected)[around].mean() < 0.015
+    file.write_text(file.read_text().replace(", marker_m: 0.12", ""))
+    (bare,) = own_objects(loaded(file))
+    assert (bare.named.marker_m, bare.field.slots.shape[1]) == (None, 16)
+
+
+@pytest.mark.parametrize(
+    ("thing", "told"),
+    [
+        ("kind: cube, face: {marker_m: 0.1}", "expected marker_m of a panel"),
+        ("kind: panel, face: {marker_m: 0.1, subject: board}", "expected no marker_m, which is of a print"),
+    ],
+)
+def test_a_border_of_what_is_no_print_is_refused(tmp_path, thing, told):
+    file = with_objects(tiny_request(tmp_path), f"{{name: board, x_m: 1.2, y_m: -1.7, {thing}}}")
+    with pytest.raises(ConfigError, match=told):
+        loaded(file)
 
 
 def test_a_yaw_in_degrees_is_refused(call, measuring):

@@ -93,6 +93,22 @@ def frame_around(picture_m: tuple[float, float], number: int, marker_m: float | 
     return MarkerFrame(picture_m, side_m, SET_SIZE * (number % SETS))
 
 
+def whole_cells(picture_m: float, cells: int, marker_m: float) -> tuple[float, int]:
+    """The size of markers next to a wanted one whose border is a whole number of a texture's cells wide.
+
+    Args:
+        picture_m: Edge of the picture [m].
+        cells: Colours along it.
+        marker_m: Wanted side of a marker [m].
+
+    Returns:
+        Side of a marker [m], and the cells across the border.
+    """
+    cell_m, sides = picture_m / cells, 1.0 + 2.0 * _QUIET_CELLS / CELLS
+    across = max(1, round(marker_m * sides / cell_m))
+    return across * cell_m / sides, across
+
+
 def marker_cells(number: int) -> NDArray[np.uint8]:
     """Cells of a marker ``[8, 8]``, 0 or 255, its black edge included."""
     return np.asarray(cv2.aruco.generateImageMarker(marker_dictionary(DICTIONARY), number, CELLS), np.uint8)

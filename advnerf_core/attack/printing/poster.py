@@ -79,23 +79,25 @@ class Poster(Printable):
         attack: The attack of this texture.
         name: The object that carries it.
         T_world_from_face: Frame ``[4, 4]`` at its centre: x out of it towards a viewer, z up.
+        marker_m: Side of the markers in the border that it had in the search [m]; None without a border.
     """
 
     attack: AttackFile
     name: str
     T_world_from_face: Array
+    marker_m: float | None
 
     def with_markers(self, marker_m: float | None = None) -> Poster:
         """The same poster with markers around it, whose numbers come from the attack's id.
 
         Args:
-            marker_m: Side of a marker [m]; None for a share of the picture.
+            marker_m: Side of a marker [m]; None for that of the search, or a share of the picture.
 
         Raises:
             PrintError: The markers are larger than the picture: they would touch or cover each other.
         """
         number = int(self.attack.attack_id, 16) % CHART_SET
-        frame = frame_around(self.size_m, number, marker_m)
+        frame = frame_around(self.size_m, number, marker_m or self.marker_m)
         if frame.marker_m > min(self.size_m):
             raise PrintError(
                 f"expected markers of at most {min(self.size_m) * MM_PER_M:g} mm, the texture's shorter side, as larger ones would touch, got "
@@ -123,8 +125,14 @@ def poster_of(attack: AttackFile, name: str | None = None, edge_m: float | None 
         else (face_texture(chosen.theta), chosen.size_m)
     )
     size_m = _size(chosen, held_m, edge_m)
-    T_world_from_face = np.asarray(chosen.T_world_from_object)
-    return Poster(texture, size_m, attack=attack, name=chosen.name, T_world_from_face=T_world_from_face)
+    return Poster(
+        texture,
+        size_m,
+        attack=attack,
+        name=chosen.name,
+        T_world_from_face=np.asarray(chosen.T_world_from_object),
+        marker_m=chosen.marker_m,
+    )
 
 
 def pixels_of(size_mm: tuple[float, float], dpi: float) -> tuple[int, int]:

@@ -68,10 +68,12 @@ class NamedObject:
 
     Attributes:
         sha256: Hash of its geometry and fixed colours.
+        marker_m: Side of the markers in its border [m]; None without one.
     """
 
     name: str
     sha256: str
+    marker_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,7 +321,14 @@ def attacked_object(
     theta = part.detach().numpy().astype(np.float32)
     size_m = field.face_size_m if isinstance(field, VoxelGridObject) else None
     return AttackedObject(
-        named.name, theta, field.T_world_from_object, field.scale, named.sha256, glb, size_m
+        named.name,
+        theta,
+        field.T_world_from_object,
+        field.scale,
+        named.sha256,
+        glb,
+        size_m,
+        named.marker_m,
     )
 
 

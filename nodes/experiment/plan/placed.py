@@ -69,6 +69,7 @@ class FaceConfig(StrictModel):
         subject: Motion-capture subject of the board if there is no target; None: no board shows it.
         display: File of 'advnerf car calibrate display' or 'printer': the colours of the monitor, or of the print, are part of the search.
         display_cos: Mean cosine, over a drive, of the angle at which the camera sees the monitor.
+        marker_m: Side of the markers in the white border of its print, which is then part of the scene, about [m]; None: no border.
     """
 
     size_m: Length = 2.0
@@ -78,6 +79,15 @@ class FaceConfig(StrictModel):
     subject: Annotated[str, Field(min_length=1)] | None = None
     display: NamedFile | None = None
     display_cos: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    marker_m: Length | None = None
+
+    @model_validator(mode="after")
+    def _of_a_print(self) -> FaceConfig:
+        if self.marker_m is not None and not (self.target is None and self.subject is None):
+            raise ValueError(
+                "expected no marker_m, which is of a print, with the target or subject of a board that shows the texture, got both"
+            )
+        return self
 
 
 class MeshConfig(StrictModel):
@@ -136,6 +146,10 @@ class PlacedObject(StrictModel):
         flat, found = self.kind in FLAT, name_of(self.kind)
         if self.face is not None and not flat:
             raise ValueError(f"expected no face, which a panel or cube has, got one of {found}")
+        if self.face is not None and self.face.marker_m is not None and self.kind != PANEL:
+            raise ValueError(
+                f"expected marker_m of a panel, which can be printed with a border, got that of a {found}"
+            )
         if self.mesh is not None and (flat or self.kind.endswith(OBJECT_SUFFIX)):
             raise ValueError(f"expected no mesh of {found}, which is made of voxels, got one")
         if self.levels and not self.kind.endswith(OBJECT_SUFFIX):

@@ -8,6 +8,7 @@ from advnerf_core.fields.voxel_grid import (
     inverse_squash,
     squash,
     squash_derivative,
+    with_border,
 )
 
 
@@ -46,6 +47,27 @@ def test_corners_run_clockwise_from_the_top_left_for_the_viewer():
     edge_right, edge_down = corners[1] - corners[0], corners[3] - corners[0]
     # Seen from +x: right x down points into the face, away from the viewer.
     np.testing.assert_allclose(np.cross(edge_right, edge_down) / 0.64, [-1.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_a_border_surrounds_the_face_as_it_is_drawn_for_a_viewer():
+    drawn = np.random.default_rng(0).uniform(size=(10, 10, 3))
+    panel = cube_face_object(0.6, 6, (0.1, 0.2, 0.3))
+    framed = with_border(panel, drawn)
+    assert framed.face_size_m == pytest.approx((0.6, 0.6))
+    assert (framed.box_max - framed.box_min)[1:] == pytest.approx([1.0, 1.0])
+    theta = torch.randn(6, 6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    colours = framed.colours(theta).numpy()
+    # Row 0 is the top (largest z), column 0 the smallest y.
+    front = colours[framed.slots[-1]][:, ::-1].transpose(1, 0, 2)
+    expected = drawn.copy()
+    expected[2:-2, 2:-2] = squash(theta).numpy()
+    np.testing.assert_allclose(front, expected, atol=1e-12)
+    np.testing.assert_allclose(
+        squash(torch.from_numpy(framed.plain_theta)), np.tile([0.1, 0.2, 0.3], (36, 1))
+    )
+    for wrong in (drawn[:9, :9], drawn[:, :9], drawn[:6, :6]):
+        with pytest.raises(ValueError, match="a border on every side of 6"):
+            with_border(panel, wrong)
 
 
 @pytest.mark.parametrize("bad", [{"size_m": 0.0}, {"depth_m": -1.0}, {"resolution": 0}])
