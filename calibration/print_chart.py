@@ -98,7 +98,7 @@ def fit_printer(rgb: Rgb, lens: Intrinsics, record: PrintRecord) -> DisplayFit:
         pose.T_camera_from_face,
         record.picture_m,
         (shape[0], shape[1]),
-        [record.markers[n] for n in pose.seen],
+        {number: record.markers[number] for number in pose.seen},
     )
     shown = record.patches.reshape(-1, 3) / 255.0
     return fit_display(shown, seen.reshape(-1, 3), least_free=_LEAST_FREE, inks=True)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from advnerf_core.attack.printing.frame import CELLS
+from advnerf_core.attack.printing.frame import CELLS, marker_cells
 from advnerf_core.attack.printing.poster import MM_PER_M, Printable
 from advnerf_core.geometry import Array, transform_points
 from advnerf_core.plain import PlainData
@@ -20,16 +20,14 @@ from calibration.print_markers import linear
 from calibration.schema import Intrinsics
 
 Rgb = NDArray[np.uint8]
-_OUTSIDE, _INSIDE = (
-    1.0 + 2.0 * 0.75 / CELLS,
-    1.0 - 2.0 * 0.5 / CELLS,
-)  # middles of white and of black, in half sides
-_PER_SIDE = 4
+_PAPER_CELLS, _PAPER = 1, 0.98  # of white around a marker; and the least share of it that counts as paper
 _CURVED_FROM = 6  # markers: fewer give a slope of the light, and no curvature
 _CLIPPED, _MOST_CLIPPED = 252, 0.2
 _LEAST_WHITE, _LEAST_RATIO = 0.02, 2.0  # of linear light; of white to black
 _MOST_UNEVEN = 0.5
 _MOST_HIDDEN, _FAR = 0.5, 64.0
+# Of a photograph: its own blur, of pixels and the interpolation between them, and a larger one that makes it the same for all.
+_OWN_BLUR_PX, _BLUR_PX = 0.6, 1.5
 _CELLS, _FINER = 96, 4  # of the found print along a side, and samples along a side of a cell
 _LONGEST_ROW = 2**14  # of OpenCV's remap
 
@@ -82,37 +80,59 @@ def _inside(pixels: Array, lens: Intrinsics) -> NDArray[np.bool_]:
     return np.asarray(((pixels >= 0.5) & (pixels <= np.array([lens.width, lens.height]) - 0.5)).all(axis=1))
 
 
-def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: Sequence[Array]) -> Light:
-    """The light on a print, from the paper around its seen markers.
+def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: Mapping[int, Array]) -> Light:
+    """The light on a print, from its seen markers and the paper around them.
+
+    At points of each marker, the light is that of white paper and of black ink, mixed as the markers' cells are in the photograph's pixels. So the
+    light is right, too, where these are larger than a cell.
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
         T_camera_from_face: Pose ``[4, 4]`` of the print in nominal units.
-        corners_m: Nominal corners ``[4, 3]`` of each seen marker [m].
+        corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
 
     Raises:
         DegenerateDataError: The paper is overexposed, or too dark.
     """
-    places = np.concatenate([_ring(corners, _OUTSIDE) for corners in corners_m])
-    dark_places = np.concatenate([_ring(corners, _INSIDE) for corners in corners_m])
-    white, black = (sampled(rgb, lens, T_camera_from_face, each) for each in (places, dark_places))
-    kept = np.isfinite(white).all(axis=1)
-    clipped = float((white[kept] >= _CLIPPED).any(axis=1).mean())
+    places, shares, seen = [], [], []
+    for number, corners in corners_m.items():
+        points = _over_marker(corners)
+        pixel = _pixel(lens, T_camera_from_face, points)
+        white = np.pad(marker_cells(number) / 255.0, _PAPER_CELLS, constant_values=1.0)
+        drawn = white.repeat(_FINER, 0).repeat(_FINER, 1)
+        shares.append(_blurred(drawn, np.hypot(_OWN_BLUR_PX, _BLUR_PX) * pixel).ravel())
+        linear_seen = linear(sampled(rgb, lens, T_camera_from_face, points))
+        seen.append(_blurred(linear_seen, _BLUR_PX * pixel).reshape(-1, 3))
+        places.append(points.reshape(-1, 3))
+    share, light, points = (np.concatenate(each) for each in (shares, seen, places))
+    kept = np.isfinite(light).all(axis=1)
+    paper = kept & (share > _PAPER)
+    clipped = float((light[paper] >= linear(_CLIPPED)).any(axis=1).mean()) if paper.any() else 0.0
     if clipped > _MOST_CLIPPED:
         raise DegenerateDataError(
             f"expected white paper below {_CLIPPED} of 255, got more at {100 * clipped:.0f} % of it: shorten the exposure"
         )
-    light, dark = linear(white[kept]), np.nanmedian(linear(black), axis=0)
-    mean = np.median(light, axis=0)
+    terms = _terms(points[kept], 6 if len(corners_m) >= _CURVED_FROM else 3)
+    both = np.concatenate([terms * share[kept, None], terms * (1.0 - share[kept, None])], axis=1)
+    coefficients, of_ink = np.split(np.linalg.lstsq(both, light[kept], rcond=None)[0], 2)
+    fitted, dark = terms @ coefficients, (terms @ of_ink).mean(axis=0)
+    mean = fitted.mean(axis=0)
     if mean.min() < _LEAST_WHITE or (mean < _LEAST_RATIO * dark).any():
         raise DegenerateDataError(
             f"expected white paper that is bright against black ink, got {np.round(mean, 3).tolist()} and {np.round(dark, 3).tolist()} of full light: "
             "lengthen the exposure, or avoid reflections"
         )
-    terms = _terms(places[kept], 6 if len(corners_m) >= _CURVED_FROM else 3)
-    coefficients = np.asarray(np.linalg.lstsq(terms, light, rcond=None)[0], np.float64)
-    fitted = terms @ coefficients
-    return Light(coefficients, dark / mean, float((np.ptp(fitted, axis=0) / fitted.mean(axis=0)).max()))
+    uneven = float((np.ptp(fitted, axis=0) / mean).max())
+    return Light(np.asarray(coefficients), np.clip(dark / mean, 0.0, 1.0), uneven)
+
+
+def _over_marker(corners: Array) -> Array:
+    """Points ``[n, n, 3]`` of a marker and the paper around it, row 0 on top: `_FINER` along a side of a cell."""
+    reach = 1.0 + 2.0 * _PAPER_CELLS / CELLS
+    middle, count = corners.mean(axis=0), (CELLS + 2 * _PAPER_CELLS) * _FINER
+    along = reach * ((np.arange(count) + 0.5) / count - 0.5)
+    right, down = corners[1] - corners[0], corners[3] - corners[0]
+    return np.asarray(middle + along[:, None, None] * down + along[None, :, None] * right)
 
 
 def picture_points(picture_m: tuple[float, float], rows: int, columns: int) -> Array:
@@ -140,7 +160,7 @@ def patch_colours(
     T_camera_from_face: Array,
     picture_m: tuple[float, float],
     shape: tuple[int, int],
-    corners_m: Sequence[Array],
+    corners_m: Mapping[int, Array],
 ) -> Array:
     """Mean colours ``[rows, columns, 3]`` in 0..1 of a chart's patches, as under the light of its middle.
 
@@ -148,7 +168,7 @@ def patch_colours(
         rgb: The photograph ``[H, W, 3]``.
         T_camera_from_face: Pose ``[4, 4]`` of the chart in nominal units.
         picture_m: Width and height of all patches [m].
-        corners_m: Nominal corners ``[4, 3]`` of each seen marker [m].
+        corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
 
     Raises:
         DegenerateDataError: The light is uneven, or a patch is not in the photograph.
@@ -221,7 +241,7 @@ def print_colours(
     Raises:
         DegenerateDataError: The exposure does not show colours, or too much is outside the photograph.
     """
-    light = light_on(rgb, lens, T_camera_from_face, list(corners_m.values()))
+    light = light_on(rgb, lens, T_camera_from_face, corners_m)
     width_mm, height_mm = sheet.sheet_mm
     fine = _CELLS * _FINER
     points = picture_points((width_mm / MM_PER_M, height_mm / MM_PER_M), fine, fine)
@@ -233,10 +253,12 @@ def print_colours(
         raise DegenerateDataError(
             f"expected at least {100 * (1 - _MOST_HIDDEN):.0f} % of the print in the photograph, got {100 * (1 - hidden.mean()):.0f} %; go back"
         )
-    inside = (np.abs(points[..., 1:]) < 0.5 * np.array(sheet.size_m)).all(axis=-1) & np.isfinite(raw).all(
-        axis=-1
-    )
-    off = (_in_white(raw, light, points, light.black) - printed)[inside]
+    pixel = _pixel(lens, T_camera_from_face, points)
+    resolved = encoded(_blurred(linear(raw), _BLUR_PX * pixel))
+    expected = encoded(_blurred(linear(printed), np.hypot(_OWN_BLUR_PX, _BLUR_PX) * pixel))
+    inside = (np.abs(points[..., 1:]) < 0.5 * np.array(sheet.size_m)).all(axis=-1)
+    inside &= np.isfinite(resolved).all(axis=-1)
+    off = (_in_white(resolved, light, points, light.black) - expected)[inside]
     unlit = _coarse(_in_white(raw, light, points, 0.0))
     red, green, blue = off.mean(axis=0)
     error = ColourError(
@@ -252,6 +274,18 @@ def print_colours(
         _whole(_completed(unlit, wanted, hidden)),
         error,
     )
+
+
+def _pixel(lens: Intrinsics, T_camera_from_face: Array, points_m: Array) -> float:
+    """A pixel of the photograph in points of a grid ``[n, n, 3]``, where the grid is finest in it."""
+    pixels = _pixels(transform_points(T_camera_from_face, points_m.reshape(-1, 3)), lens)
+    grid = pixels.reshape((*points_m.shape[:2], 2))
+    least_px = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in range(2))
+    return 1.0 / max(least_px, 1.0 / len(points_m))
+
+
+def _blurred(values: Array, sigma: float) -> Array:
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), float(sigma)), np.float64)
 
 
 def _completed(found: Array, wanted: Array, hidden: NDArray[np.bool_]) -> Array:
@@ -275,14 +309,6 @@ def _whole(colours: Array) -> Rgb:
 def _coarse(fine: ArrayLike) -> Array:
     parts = np.asarray(fine, np.float64).reshape(_CELLS, _FINER, _CELLS, _FINER, 3)
     return np.asarray(parts.mean(axis=(1, 3)))
-
-
-def _ring(corners: Array, share: float) -> Array:
-    """Points ``[n, 3]`` about a marker, at a share of the way from its middle to its sides."""
-    middle = corners.mean(axis=0)
-    ends = middle + share * (corners - middle)
-    along = (np.arange(_PER_SIDE) + 0.5)[:, None] / _PER_SIDE
-    return np.concatenate([a + along * (b - a) for a, b in zip(ends, np.roll(ends, -1, axis=0), strict=True)])
 
 
 def _terms(points_m: Array, count: int) -> Array:

@@ -24,7 +24,7 @@ from advnerf_core.geometry import (
     rotation_z,
 )
 from calibration.print_chart import make_chart
-from calibration.print_colour import ColourError
+from calibration.print_colour import ColourError, print_colours
 from calibration.print_markers import why_none
 from calibration.print_measurement import WIDTH, of_photograph
 from calibration.print_pose import PrintPose
@@ -43,6 +43,11 @@ from tests.support.photographed import before_camera, lens, photograph, scaled
 from tests.support.tiny_request import CALIBRATION, loaded, tiny_request, with_objects
 
 LENS = lens(960, 720, 750.0)
+FACE = {
+    "method": "gradient", "subject": "board", "corners_in_subject": face_corners_in_object(0.4), "T_world_from_object": np.eye(4),
+    "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32), "scene_sha256": "", "policy_sha256": "", "config_sha256": "", "seed": 0,
+    "predicted_total_cte_m": None, "software_version": "0",
+}  # fmt: skip
 START_NS = 1_800_000_000_000_000_000
 
 
@@ -63,12 +68,8 @@ def call(monkeypatch, capsys):
 @pytest.fixture
 def folder(tmp_path):
     """An attack of 0.4 m, its print, and the lens of a phone."""
-    attack = face_attack(
-        method="gradient", theta=np.random.default_rng(0).normal(0.0, 2.0, (8, 8, 3)).astype(np.float32), size_m=(0.4, 0.4),
-        subject="board", corners_in_subject=face_corners_in_object(0.4), T_world_from_object=np.eye(4),
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32), scene_sha256="", policy_sha256="", config_sha256="", seed=0,
-        predicted_total_cte_m=None, software_version="0",
-    )  # fmt: skip
+    theta = np.random.default_rng(0).normal(0.0, 2.0, (8, 8, 3)).astype(np.float32)
+    attack = face_attack(theta=theta, size_m=(0.4, 0.4), **FACE)
     save_attack(tmp_path / "a.attack.safetensors", attack)
     save_calibration(LENS, tmp_path / "lens.yaml")
     return tmp_path
@@ -108,6 +109,30 @@ def test_a_photograph_gives_pose_and_colours_and_with_one_length_the_size(call, 
     assert "+3." in said or "+2.9" in said
     assert call(*command, "--width", 0.412)[0] == 0
     assert json.loads((folder / "photo.measured.json").read_text())["size_m"] == pytest.approx((0.412, 0.412))
+
+
+@pytest.mark.parametrize("cells", [8, 64])
+@pytest.mark.parametrize(
+    ("camera", "away_m"),
+    [(LENS, 0.9), (LENS, 2.0), (lens(336, 188, 174.0), 0.8)],
+    ids=["near", "far", "small"],
+)
+def test_a_right_print_is_right_from_afar_and_another_one_is_not(camera, away_m, cells):
+    """Where neither the texture's cells nor those of the markers are a pixel wide, the photograph has their mean light."""
+
+    def print_of(seed):
+        theta = np.random.default_rng(seed).normal(0.0, 2.0, (cells, cells, 3)).astype(np.float32)
+        return poster_of(face_attack(theta=theta, size_m=(0.4, 0.4), **FACE)).with_markers()
+
+    right = print_of(0)
+    T = before_camera(away_m, 10, 3, 2)
+    picture = photograph([(scaled(right, 1.0, 1.0, 75.0), T)], camera, light=(0.9, 0.8, 0.7))
+    error = print_colours(picture, camera, T, right, right.frame.corners_m).error
+    assert (error.rms < 12.0, error.far_share < 0.01) == (True, True), error
+    if cells == 8:  # of finer ones little more than the mean is left
+        other = print_of(1)
+        wrong = print_colours(picture, camera, T, other, right.frame.corners_m).error
+        assert wrong.far_share > 0.3
 
 
 def test_a_chart_beside_it_is_a_card(call, folder):
