@@ -59,7 +59,7 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     # A claim about places is told too, with the places where nothing was found.
     (transfers,) = [each.text for each in answers([], published) if each.question == "Does it transfer?"]
     assert "4 places and 2 victims of metadrive_billboard it adds +0.487 m per tick" in transfers
-    assert "and +22 points to the share of drives off the lane, at 2 of 8." in transfers
+    assert "and +22 points of drives off the track." in transfers
     # Nothing is claimed that was not measured.
     assert "How fast?" not in found
     assert answers([], tmp_path / "none") == []
