@@ -7,9 +7,9 @@ import pytest
 from nodes.cli.main import main
 
 
-def advnerf(monkeypatch: pytest.MonkeyPatch, *words: str) -> object:
+def advnerf(monkeypatch: pytest.MonkeyPatch, *words: object) -> object:
     """The exit code of a command."""
-    monkeypatch.setattr(sys, "argv", ["advnerf", *words])
+    monkeypatch.setattr(sys, "argv", ["advnerf", *map(str, words)])
     with pytest.raises(SystemExit) as ended:
         main()
     return ended.value.code

@@ -18,6 +18,7 @@ from calibration.schema import CameraCalibration, load_calibration
 from nodes.experiment.node.prepare import load_request
 
 if TYPE_CHECKING:
+    from advnerf_core.attack.search.record import Evaluation
     from nodes.experiment.show.context import Experiment
 
 CALIBRATION = Path(__file__).parents[2] / "calibration" / "twin"
@@ -50,6 +51,16 @@ def tiny_request(folder: Path, evaluations: int = 3) -> Path:
     file = folder / "tiny.experiment.yaml"
     file.write_text(TEXT.format(calibration=CALIBRATION, evaluations=evaluations))
     return file
+
+
+class StoppedError(Exception):
+    """A search was stopped."""
+
+
+def stop_at_one(evaluation: Evaluation) -> None:
+    """Stop a search after its second evaluation."""
+    if evaluation.iteration == 1:
+        raise StoppedError
 
 
 def with_objects(file: Path, *objects: str, rest: str = "") -> Path:

@@ -1,7 +1,6 @@
 """Requests for attacks on meshes: run, resumed to the same bytes, exported; and what they refuse."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -10,16 +9,16 @@ import torch
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.data.image_files import write_image
 from advnerf_core.objects.mesh.engine import MeshEngineError, engine
-from nodes.cli import main as cli
 from nodes.experiment.node.check import check
 from nodes.experiment.node.prepare import prepare
 from nodes.experiment.node.printed import export_attack
 from nodes.experiment.node.search import run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
+from tests.support.commands import advnerf
 from tests.support.glb import mesh_from_glb
 from tests.support.strangers import write_spiral
-from tests.support.tiny_request import loaded, tiny_request, with_objects
+from tests.support.tiny_request import StoppedError, loaded, stop_at_one, tiny_request, with_objects
 
 HYDRANT = "{name: hydrant, kind: hydrant, x_m: 1.2, y_m: -1.7, mesh: {texels: 8, height_m: 0.6}}"
 BALL = "{name: ball, kind: ball, x_m: 0.9, y_m: -1.9, mesh: {texels: 8, height_m: 0.5}}"
@@ -32,15 +31,6 @@ def mitsuba_works():
         engine()
     except MeshEngineError as error:
         pytest.skip(str(error))
-
-
-class StoppedError(Exception):
-    pass
-
-
-def stop_at_one(evaluation):
-    if evaluation.iteration == 1:
-        raise StoppedError
 
 
 def asked(folder, *objects, rest=""):
@@ -124,10 +114,7 @@ def test_what_does_not_fit_is_refused(tmp_path, objects, rest, what):
 def test_a_file_that_is_no_mesh_is_one_line_and_exit_code_2(tmp_path, capsys, monkeypatch):
     (tmp_path / "broken.glb").write_bytes(b"nothing")
     file = asked(tmp_path, "{name: a, kind: broken.glb, x_m: 1, y_m: 1, mesh: {}}")
-    monkeypatch.setattr(sys, "argv", ["advnerf", "attack", "run", str(file), "-o", str(tmp_path / "out")])
-    with pytest.raises(SystemExit) as stopped:
-        cli.main()
-    assert stopped.value.code == 2
+    assert advnerf(monkeypatch, "attack", "run", file, "-o", tmp_path / "out") == 2
     error = capsys.readouterr().err
     assert "broken.glb" in error
     assert "Traceback" not in error

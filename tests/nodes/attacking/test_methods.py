@@ -1,7 +1,6 @@
 """A method that a user brings runs a request, and a broken one is one line."""
 
 import json
-import sys
 
 import pytest
 import torch
@@ -10,15 +9,15 @@ from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.methods import MethodError
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.errors import AdvnerfError
-from nodes.cli import main as cli
 from nodes.experiment.node.prepare import prepare, request_text
 from nodes.experiment.node.request import parse_request
 from nodes.experiment.node.search import run_attack
 from nodes.experiment.node.worker import work
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
+from tests.support.commands import advnerf
 from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
-from tests.support.tiny_request import loaded, tiny_request
+from tests.support.tiny_request import StoppedError, loaded, stop_at_one, tiny_request
 
 FORGETFUL = """
 import torch
@@ -35,22 +34,6 @@ def search(problem, settings, run):
 Spiral = Method(search)
 """
 FROM_FILE = "over.method=[spiral.py:Spiral]"
-
-
-class StoppedError(Exception):
-    pass
-
-
-def stop_at_one(evaluation):
-    if evaluation.iteration == 1:
-        raise StoppedError
-
-
-def command(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["advnerf", "attack", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    return ended.value.code
 
 
 def test_a_method_of_a_file_runs_a_request_and_resumes_to_the_same_bytes(tmp_path):
@@ -145,7 +128,7 @@ def test_a_broken_method_is_one_line_before_anything_is_written(tmp_path, monkey
     file = tiny_request(tmp_path)
     (tmp_path / "spiral.py").write_text("turns = 1 / 0\n")
     out = tmp_path / "out"
-    assert command(monkeypatch, "run", file, "-o", out, "--set", FROM_FILE) == 2
+    assert advnerf(monkeypatch, "attack", "run", file, "-o", out, "--set", FROM_FILE) == 2
     named, said = capsys.readouterr().err.splitlines()
     assert named.startswith("executes ")
     assert "attack method" in said

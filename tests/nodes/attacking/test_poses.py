@@ -1,18 +1,17 @@
 """Pose attacks of a request, from its file to attack file, landscape and robustness map, by the command line too."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 
 from advnerf_core.attack.artifact import load_attack
-from nodes.cli import main as cli
 from nodes.experiment.node.poses import mapped
 from nodes.experiment.node.prepare import prepare
 from nodes.experiment.node.search import run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
+from tests.support.commands import advnerf
 from tests.support.tiny_request import loaded, tiny_request
 
 BOUNDS = "bounds: {x_m: [0.9, 1.6], y_m: [-1.5, -1.2], yaw_rad: [2.8, 3.4]}"
@@ -33,17 +32,10 @@ def request_file(folder, bounds=BOUNDS):
     return file
 
 
-def command(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["advnerf", "attack", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    return ended.value.code
-
-
 def test_commands_search_map_and_find_their_work_again(tmp_path, monkeypatch, capsys):
     file, folder = request_file(tmp_path), tmp_path / "out"
     attack_path = folder / "seed_0.attack.safetensors"
-    assert command(monkeypatch, "run", file, "-o", folder) == 0
+    assert advnerf(monkeypatch, "attack", "run", file, "-o", folder) == 0
     attack, content = load_attack(attack_path), attack_path.read_bytes()
     (found,) = attack.objects
     placement = found.placement
@@ -57,18 +49,18 @@ def test_commands_search_map_and_find_their_work_again(tmp_path, monkeypatch, ca
     assert curve["attack_id"] == attack.attack_id
     np.testing.assert_allclose(curve["placements"], [placement])
     assert (folder / "seed_0.poses.png").stat().st_size > 1000
-    assert command(monkeypatch, "maps", file, "-o", folder, "--attack", attack_path) == 0
+    assert advnerf(monkeypatch, "attack", "maps", file, "-o", folder, "--attack", attack_path) == 0
     for name in ("landscape", "robustness"):
         assert (folder / f"{name}.png").stat().st_size > 1000
     assert len(json.loads((folder / "landscape.json").read_text())["cells"]) == 4
     assert np.array(json.loads((folder / "robustness.json").read_text())["cells"]["1"]).shape == (3, 2)
-    assert command(monkeypatch, "run", file, "-o", folder) == 0
+    assert advnerf(monkeypatch, "attack", "run", file, "-o", folder) == 0
     assert attack_path.read_bytes() == content
     capsys.readouterr()
     # Another question in the same folder is refused in one line.
-    assert command(monkeypatch, "maps", file, "-o", folder) == 2
+    assert advnerf(monkeypatch, "attack", "maps", file, "-o", folder) == 2
     assert "belongs to a map with other settings" in capsys.readouterr().err
-    assert command(monkeypatch, "maps", file, "-o", tmp_path / "b", "--set", "maps.object=3") == 2
+    assert advnerf(monkeypatch, "attack", "maps", file, "-o", tmp_path / "b", "--set", "maps.object=3") == 2
     assert "expected an object of 0" in capsys.readouterr().err
 
 
@@ -143,10 +135,10 @@ def test_a_request_that_cannot_be_is_refused(tmp_path, bounds, changes, what):
 
 
 def test_a_request_without_poses_and_bounds_on_the_lane_end_in_one_line(tmp_path, monkeypatch, capsys):
-    assert command(monkeypatch, "maps", tiny_request(tmp_path / "plain"), "-o", tmp_path / "a") == 2
+    assert advnerf(monkeypatch, "attack", "maps", tiny_request(tmp_path / "plain"), "-o", tmp_path / "a") == 2
     assert "expected space.kind places" in capsys.readouterr().err
     on_lane = request_file(tmp_path / "lane", BOUNDS.replace("[-1.5, -1.2]", "[-2.1, -1.9]"))
-    assert command(monkeypatch, "run", on_lane, "-o", tmp_path / "b") == 2
+    assert advnerf(monkeypatch, "attack", "run", on_lane, "-o", tmp_path / "b") == 2
     said = capsys.readouterr().err
     assert "expected bounds with a place at least 0.3 m beside the path" in said
     assert "Traceback" not in said

@@ -2,7 +2,6 @@
 
 import datetime
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import load_policy, save_policy
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import save_calibration
-from nodes.cli import main as cli
 from nodes.experiment.node.check import check
 from nodes.experiment.node.memory import measured_mib
 from nodes.experiment.node.prepare import load_request, prepare, request_text
@@ -27,17 +25,8 @@ from nodes.experiment.node.search import attack_file, run_attack
 from nodes.experiment.steps.keys import NoSuchCellError
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
-from tests.support.tiny_request import loaded, tiny_request
-
-
-class StoppedError(Exception):
-    pass
-
-
-def stop_at_one(evaluation):
-    if evaluation.iteration == 1:
-        raise StoppedError
-
+from tests.support.commands import advnerf
+from tests.support.tiny_request import StoppedError, loaded, stop_at_one, tiny_request
 
 _SLOW = pytest.mark.slow  # the same loop with another search inside; tests of the searches resume them too
 
@@ -101,13 +90,11 @@ def test_a_seed_without_its_curve_is_searched_again(tmp_path):
 
 def test_a_request_that_failed_to_load_does_not_lock_its_folder(tmp_path, monkeypatch, capsys):
     file, folder = tiny_request(tmp_path, evaluations=1), tmp_path / "out"
-    assert (
-        command(monkeypatch, "run", file, "-o", folder, "--set", "victims.mine.policy=not_here.safetensors")
-        != 0
-    )
+    wrong = "victims.mine.policy=not_here.safetensors"
+    assert advnerf(monkeypatch, "attack", "run", file, "-o", folder, "--set", wrong) != 0
     assert "not_here.safetensors" in capsys.readouterr().err
-    assert command(monkeypatch, "run", file, "-o", folder) == 0
-    assert command(monkeypatch, "run", file, "-o", folder, "--set", "horizon=4") != 0
+    assert advnerf(monkeypatch, "attack", "run", file, "-o", folder) == 0
+    assert advnerf(monkeypatch, "attack", "run", file, "-o", folder, "--set", "horizon=4") != 0
     assert "belongs to another attack" in capsys.readouterr().err
     kept = load_request(folder / "request.experiment.yaml", folder=folder)
     assert (
@@ -200,15 +187,12 @@ def test_a_monitor_in_the_loop_is_searched_through_its_colours_and_the_gradient_
 
 def test_show_writes_the_texture_of_a_run_that_was_repeated(tmp_path, monkeypatch, capsys):
     file = tiny_request(tmp_path)
-    for command in (
-        ["run", str(file), "-o", str(tmp_path / "out")],
-        ["run", str(file), "-o", str(tmp_path / "out")],
-        ["show", str(tmp_path / "out" / "seed_0.attack.safetensors")],
+    for words in (
+        ["run", file, "-o", tmp_path / "out"],
+        ["run", file, "-o", tmp_path / "out"],
+        ["show", tmp_path / "out" / "seed_0.attack.safetensors"],
     ):
-        monkeypatch.setattr(sys, "argv", ["advnerf", "attack", *command])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        assert ended.value.code == 0
+        assert advnerf(monkeypatch, "attack", *words) == 0
     assert (tmp_path / "out" / "seed_0.texture.png").exists()
     assert load_attack(tmp_path / "out" / "seed_0.attack.safetensors").attack_id in capsys.readouterr().out
 
@@ -249,18 +233,11 @@ def test_a_policy_that_ignores_what_it_sees_is_a_result(tmp_path):
     assert len(set(json.loads(found.with_name("seed_0.json").read_text())["predicted_total_cte_m"])) == 1
 
 
-def command(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["advnerf", "attack", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    return ended.value.code
-
-
 def test_every_result_stands_beside_the_drive_without_attack(tmp_path, monkeypatch, capsys):
     file = tiny_request(tmp_path, evaluations=2)
     starts = "attack.start_poses=[[0.0, -1.65, 0.5], [0.0, -2.3, -0.4]]"  # they head away from the path
     changes = ["--set", starts]
-    assert command(monkeypatch, "run", file, "-o", tmp_path / "out", *changes) == 0
+    assert advnerf(monkeypatch, "attack", "run", file, "-o", tmp_path / "out", *changes) == 0
     printed = capsys.readouterr().out
     attack = load_attack(tmp_path / "out" / "seed_0.attack.safetensors")
     prepared = prepare(loaded(file, [starts]))
@@ -273,15 +250,14 @@ def test_every_result_stands_beside_the_drive_without_attack(tmp_path, monkeypat
     assert beside in printed
     assert "NO DRIVE: without an attack this policy does not drive here" in printed
     assert json.loads((tmp_path / "out" / "seed_0.json").read_text())["clean_drive"] == clean.to_dict()
-    assert command(monkeypatch, "run", file, "-o", tmp_path / "out", *changes) == 0
+    assert advnerf(monkeypatch, "attack", "run", file, "-o", tmp_path / "out", *changes) == 0
     assert beside in capsys.readouterr().out
-    assert command(monkeypatch, "show", tmp_path / "out" / "seed_0.attack.safetensors") == 0
+    assert advnerf(monkeypatch, "attack", "show", tmp_path / "out" / "seed_0.attack.safetensors") == 0
     shown = capsys.readouterr().out
     assert "drive without attack" in shown
     assert "NO DRIVE" in shown
-    assert command(
-        monkeypatch, "check", file, "-o", tmp_path / "out", "--directions", 2, "--no-memory", *changes
-    ) in (0, 1)
+    quick = ("--directions", 2, "--no-memory", *changes)
+    assert advnerf(monkeypatch, "attack", "check", file, "-o", tmp_path / "out", *quick) in (0, 1)
     checked = capsys.readouterr().out
     assert f"drive without attack: total CTE {clean.mean_total_cte_m:.2f} m over 3 ticks" in checked
     assert "NO DRIVE" in checked
@@ -296,7 +272,7 @@ def test_the_memory_of_a_gradient_is_that_of_one_start_in_another_process(tmp_pa
 
 def test_a_policy_that_drives_gets_no_warning(tmp_path, monkeypatch, capsys):
     file = tiny_request(tmp_path, evaluations=1)  # three ticks on the straight: no network can leave it
-    assert command(monkeypatch, "run", file, "-o", tmp_path / "out") == 0
+    assert advnerf(monkeypatch, "attack", "run", file, "-o", tmp_path / "out") == 0
     printed = capsys.readouterr().out
     assert ", without attack 0." in printed
     assert "NO DRIVE" not in printed

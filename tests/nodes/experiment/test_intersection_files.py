@@ -1,7 +1,6 @@
 """The experiment file, its stages, and which change redoes what."""
 
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.cli.main import main
 from nodes.experiment.engine.stages import run_stages
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps import run
@@ -17,6 +15,7 @@ from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
+from tests.support.commands import advnerf
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
 
@@ -137,12 +136,9 @@ def test_bad_files_are_one_clear_error(
     said: str,
 ) -> None:
     file = tiny_file(**changes)
-    words = ["experiment", "run", str(file), "--setting", "tiny", "--folder", str(tmp_path / "run")]
-    monkeypatch.setattr(sys, "argv", ["advnerf", *words])
-    with pytest.raises(SystemExit) as ended:
-        main()
+    words = ("experiment", "run", file, "--setting", "tiny", "--folder", tmp_path / "run")
+    assert advnerf(monkeypatch, *words) == 2
     told = capsys.readouterr()
-    assert ended.value.code == 2
     assert said in told.out + told.err
     assert "Traceback" not in told.out + told.err
     assert not (tmp_path / "run").exists()
