@@ -208,10 +208,11 @@ def _trust(result: AuditResult) -> str:
         True: " A second copy, learned from the other half of the photographs, makes the policy steer alike; the object was searched in one and judged in the other.",
         False: " A second copy, learned from the other half of the photographs, makes the policy steer otherwise.",
     }[fidelity.halves_agree]
+    unit = "rad" if result.vehicle is not None else "rad/s"  # a vehicle without a wheelbase turns by its rate
     why = "".join(f" {each[0].upper()}{each[1:]}." for each in fidelity.why)
     return (
         f"On {fidelity.views} pictures that it was not learned from, the learned place reaches {fidelity.psnr_db:.1f} dB in the policy's view, and the "
-        f"policy steers {fidelity.steering_difference:.3g} rad otherwise in the mean.{halves}{why}"
+        f"policy steers {fidelity.steering_difference:.3g} {unit} otherwise in the mean.{halves}{why}"
     )
 
 

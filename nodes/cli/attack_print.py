@@ -49,7 +49,10 @@ def attack_print(
     marker_mm: Annotated[
         float | None,
         typer.Option(
-            min=8.0, max=500.0, help="Side of a marker.", show_default="that of the search, or 12 % of the texture, 20 to 150"
+            min=8.0,
+            max=500.0,
+            help="Side of a marker.",
+            show_default="that of the search, or 12 % of the texture, 20 to 150",
         ),
     ] = None,
 ) -> None:

@@ -271,7 +271,7 @@ def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latenc
 def _timings(experiment: Experiment) -> dict[str, float]:
     config = experiment.config
     policies = dict.fromkeys(map(config.policy_stage, config.attacked))
-    names = ("capture", "scene", "bake", *policies, "object", "live")
+    names = ("capture", "scene", "bake", *policies, "object", "retrain", "live")
     records = {name: read_artefact(experiment.stage_folder(name)) for name in names}
     results = [experiment.cell_result(cell) for cell in experiment.cells]
     seconds = {name: record.seconds for name, record in records.items() if record is not None}

@@ -118,7 +118,14 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             )
             file = here / "policy.safetensors"
             if not file.exists():
-                fine_tune(victim, kept, new, settings, file, _stepping(told, wanted.steps))
+                fine_tune(
+                    victim,
+                    kept,
+                    new,
+                    settings,
+                    file,
+                    _stepping(told, wanted.steps, experiment.car.control_unit),
+                )
             victim, kept = load_policy(file), [*kept, *new]
 
 
@@ -144,9 +151,9 @@ def _part(report: Report, begin: float, share: float, name: str) -> Told:
     return told
 
 
-def _stepping(told: Told, steps: int) -> Callable[[int, float], None]:
+def _stepping(told: Told, steps: int, unit: str) -> Callable[[int, float], None]:
     def stepped(step: int, loss: float) -> None:
-        told(0.7 + 0.3 * step / steps, f"fine-tuning: error {loss**0.5:.3f} rad/s")
+        told(0.7 + 0.3 * step / steps, f"fine-tuning: error {loss**0.5:.3f} {unit}")
 
     return stepped
 
