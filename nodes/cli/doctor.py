@@ -25,12 +25,6 @@ def doctor(
         ),
     ] = None,
     folder: Annotated[Path, typer.Option(help="Folder of runs, whose disk is checked.")] = Path("runs"),
-    vicon_port: Annotated[
-        int, typer.Option(min=1, max=65535, help="UDP port of the motion-capture stream.")
-    ] = 51001,
-    vesc: Annotated[
-        str | None, typer.Option(help="Serial device of the VESC.", show_default="detected")
-    ] = None,
     host: Annotated[
         str | None, typer.Option(help="Host of the launch file that this computer is, or all.")
     ] = None,
@@ -61,7 +55,7 @@ def doctor(
     from nodes.lab.doctor.check import FAILURE, examine, worst
 
     findings = []
-    for finding in examine(_checks(file, folder, vicon_port, vesc, host, overrides or [])):
+    for finding in examine(_checks(file, folder, host, overrides or [])):
         findings.append(finding)
         if not as_json:
             _print(finding)
@@ -74,15 +68,13 @@ def doctor(
     fail_unless(state != FAILURE)
 
 
-def _checks(
-    file: Path | None, folder: Path, vicon_port: int, vesc: str | None, host: str | None, overrides: list[str]
-) -> list[DoctorCheck]:
+def _checks(file: Path | None, folder: Path, host: str | None, overrides: list[str]) -> list[DoctorCheck]:
     if file is None:
         from nodes.lab.doctor.general import checks
 
         if overrides or host:
             raise typer.BadParameter("--set and --host need a launch file; give one")
-        return checks(folder, vicon_port, vesc)
+        return checks(folder)
     from nodes.lab.doctor.launch import checks_of
     from nodes.launching.launch_file import load_launch
 

@@ -15,13 +15,8 @@ _CHILD_DEADLINE_S = CHILD_S + 5.0
 _ROLES = ("camera", "vicon", "compositor", "policy", "safety", "motor")
 
 
-def checks(folder: Path, vicon_port: int, vesc_port: str | None = None) -> list[DoctorCheck]:
-    """Return all checks of a computer.
-
-    Args:
-        vesc_port: Serial device of the VESC; None detects it.
-    """
-    vesc = partial(motor.vesc, vesc_port, required=vesc_port is not None)
+def checks(folder: Path) -> list[DoctorCheck]:
+    """Return all checks of a computer."""
     recorded = bytes_per_s(ImageFormat(), publishers=_ROLES)
     return [
         DoctorCheck("versions", machine.versions),
@@ -36,8 +31,8 @@ def checks(folder: Path, vicon_port: int, vesc_port: str | None = None) -> list[
         DoctorCheck("keys", machine.keys),
         DoctorCheck("clock", machine.clock),
         DoctorCheck("serial", motor.serial_ports),
-        DoctorCheck("VESC", vesc),
-        DoctorCheck("VICON", partial(mocap.listen, ViconConfig((), "", vicon_port))),
+        DoctorCheck("VESC", partial(motor.vesc, None)),
+        DoctorCheck("VICON", partial(mocap.listen, ViconConfig((), ""))),
         DoctorCheck("camera", cameras.video_devices),
         DoctorCheck("OAK", cameras.oaks, 30.0),
         DoctorCheck("screens", graphics.screens, _CHILD_DEADLINE_S),

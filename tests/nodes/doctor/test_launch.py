@@ -6,6 +6,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,11 @@ import yaml
 from hardware.emulators.vesc_emulator import VescEmulator
 from hardware.emulators.vesc_firmware import VescEmulatorConfig
 from hardware.emulators.vicon_emulator import ViconEmulator, ViconEmulatorConfig
+from hardware.mocap.vicon import ViconConfig
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.cli import main as cli
-from nodes.lab.doctor import graphics, launch, machine
+from nodes.lab.doctor import general, graphics, launch, machine, motor
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, examine
 from nodes.lab.doctor.launch import checks_of, pictures_of
 from nodes.launching.launch_file import load_launch
@@ -219,9 +221,9 @@ def test_a_computer_without_a_launch_file_in_mind(tmp_path, monkeypatch, capsys)
     for name in ("torch", "egl", "llvm", "screens"):  # processes that take seconds; tests of their own
         monkeypatch.setattr(graphics, name, lambda required=False: [])
     monkeypatch.setattr(machine, "clock", lambda: [])
-    code, output, _ = run(
-        monkeypatch, capsys, "--folder", tmp_path, "--vicon-port", free_udp_port(), "--json"
-    )
+    listening = partial(ViconConfig, port=free_udp_port())  # of no lab that runs beside this test
+    monkeypatch.setattr(general, "ViconConfig", listening)
+    code, output, _ = run(monkeypatch, capsys, "--folder", tmp_path, "--json")
     told = json.loads(output)["findings"]
     assert code == 0
     assert {
@@ -240,9 +242,8 @@ def test_a_computer_without_a_launch_file_in_mind(tmp_path, monkeypatch, capsys)
     } <= {row["check"] for row in told}
     assert ABSENT in {row["state"] for row in told if row["check"] == "VICON"}
     with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as vesc:
-        code, output, _ = run(
-            monkeypatch, capsys, "--folder", tmp_path, "--vesc", vesc.port, "--vicon-port", free_udp_port()
-        )
+        monkeypatch.setattr(motor, "FIXED_NAME", Path(vesc.port))
+        code, output, _ = run(monkeypatch, capsys, "--folder", tmp_path)
     assert code == 1
     assert f"-> advnerf car motor set-timeout --vesc {vesc.port}" in output
 
