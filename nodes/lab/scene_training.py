@@ -222,16 +222,13 @@ def _box(
 
 
 def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: ImageSet) -> MarchConfig:
-    """Sample placement for training and rendering: by the default rule, unless the request overrides it."""
+    """Sample placement for training and rendering: by the default rule, with the pixels of the request."""
     try:
-        march = pixel_intervals(
+        return pixel_intervals(
             images.pinholes, images.T_world_from_camera, field, request.near, request.interval_px
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    if request.interval is not None:
-        march = replace(march, smallest_step_m=request.interval[0], largest_step_m=request.interval[1])
-    return march if request.interval_growth is None else replace(march, step_growth=request.interval_growth)
 
 
 def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> TrainConfig:

@@ -90,18 +90,6 @@ class TrainingRequest:
             show_default="4; 1.5 if all cameras stand outside the box",
         ),
     ] = None
-    interval: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            metavar="SHORTEST LONGEST",
-            help="Shortest and longest sample interval, in the unit of the file.",
-            show_default="1/1024 and 1/64 of the box",
-        ),
-    ] = None
-    interval_growth: Annotated[
-        float | None,
-        typer.Option(help="Sample interval per distance.", show_default="--interval-px / focal length"),
-    ] = None
     exposure: Annotated[
         bool,
         typer.Option(
@@ -126,10 +114,6 @@ class TrainingRequest:
             raise ConfigError(f"expected a preset of {', '.join(presets)}, got {self.preset!r}")
         if self.interval_px is not None and not self.interval_px > 0.0:
             raise ConfigError(f"expected --interval-px above 0, got {self.interval_px}")
-        if self.interval is not None and not 0.0 < self.interval[0] <= self.interval[1]:
-            raise ConfigError(f"expected --interval as 0 < SHORTEST <= LONGEST, got {list(self.interval)}")
-        if self.interval_growth is not None and not self.interval_growth >= 0.0:
-            raise ConfigError(f"expected --interval-growth of 0 or more, got {self.interval_growth}")
 
     @property
     def box_m(self) -> tuple[tuple[float, float, float], tuple[float, float, float]] | None:

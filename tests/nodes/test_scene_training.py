@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 
 import cv2
@@ -20,11 +19,11 @@ from advnerf_core.scene.intervals import INTERVAL_PX_FROM_OUTSIDE
 from advnerf_core.scene.presets import PRESETS
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, train_scene
-from nodes.cli import main as cli
 from nodes.lab import scene_training
 from nodes.lab.scene_training import depth_in_mm, sample_intervals, scene_field
 from nodes.lab.training_request import TrainingRequest
 from nodes.runtime.errors import ConfigError
+from tests.support.commands import advnerf
 
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 CAMERA = Pinhole(40, 40, 50.0, 50.0, 20.0, 20.0)
@@ -211,10 +210,8 @@ def test_alpha_that_is_opaque_everywhere_is_none(pictures: Path) -> None:
 def test_help_says_what_presets_are_for(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["advnerf", "scene", "train", "--help"])
     monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit):
-        cli.main()
+    assert advnerf(monkeypatch, "scene", "train", "--help") == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "--unbounded" in text
     assert "instant-ngp" in text
@@ -241,10 +238,7 @@ def test_pictures_with_alpha_are_learned_with_it_end_to_end(
         ],
         ["render", out / "scene.safetensors", pictures, "--held-out", "-o", tmp_path / "views"],
     ):
-        monkeypatch.setattr(sys, "argv", ["advnerf", "scene", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        assert not ended.value.code
+        assert advnerf(monkeypatch, "scene", *arguments) == 0
     assert "images have alpha" in capsys.readouterr().out
     figures = json.loads((out / "held_out.json").read_text())
     assert figures["mean"]["psnr_db"] > 26.0
@@ -270,8 +264,7 @@ def test_intervals_follow_the_images_unless_the_user_says_otherwise(pictures: Pa
     assert chosen(interval_px=0.5 * INTERVAL_PX_FROM_OUTSIDE) == dataclasses.replace(
         rule, step_growth=0.5 * rule.step_growth
     )
-    assert chosen(interval=(0.01, 0.02), near=0.3) == MarchConfig(0.3, 0.01, 0.02, rule.step_growth, 1024)
-    assert chosen(interval_growth=0.5) == dataclasses.replace(rule, step_growth=0.5)
+    assert chosen(near=0.3) == dataclasses.replace(rule, near_m=0.3)
 
 
 @pytest.mark.slow
@@ -279,19 +272,16 @@ def test_options_of_intervals_reach_training_and_renderer(
     pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def run(*arguments: object) -> str:
-        monkeypatch.setattr(sys, "argv", ["advnerf", "scene", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        assert not ended.value.code
+        assert advnerf(monkeypatch, "scene", *arguments) == 0
         return capsys.readouterr().out
 
     # A thin box has few cells: after one step all of them are occupied, and each is looked into.
     box = ("--box-low", -0.8, -0.1, -0.1, "--box-high", 0.8, 0.1, 0.1)
-    own = ("--interval", 0.02, 0.04, "--interval-growth", 0.5)
-    text = run("train", pictures, "-o", tmp_path, "--steps", 1, "--size", 16, 16, *box, *own)
-    assert "sample intervals 0.02 .. 0.04, 0.5 of the distance between" in text
+    text = run("train", pictures, "-o", tmp_path, "--steps", 1, "--size", 16, 16, *box, "--interval-px", 8)
+    growth = 8 / (50.0 * 16 / 40)  # the lens of the resized pictures
+    assert f"{growth:.3g} of the distance between" in text
     scene = tmp_path / "scene.safetensors"
-    assert FieldRenderer.from_file(scene).march == MarchConfig(1.6 * (1 / 80), 0.02, 0.04, 0.5, 1024)
+    assert FieldRenderer.from_file(scene).march.step_growth == pytest.approx(growth)
     # After one step nothing is dense enough to be kept; haze shows intervals as well as walls do.
     field, occupied, metadata = load_scene(scene)
     save_scene(scene, field, np.ones_like(occupied), metadata)
@@ -307,17 +297,9 @@ def test_options_of_intervals_reach_training_and_renderer(
     assert fine != coarse
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"interval_px": 0.0}, "--interval-px above 0"),
-        ({"interval": (0.2, 0.1)}, "SHORTEST <= LONGEST"),
-        ({"interval_growth": -1.0}, "--interval-growth of 0 or more"),
-    ],
-)
-def test_impossible_intervals_are_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        request_for(tmp_path, **changes)
+def test_impossible_intervals_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--interval-px above 0"):
+        request_for(tmp_path, interval_px=0.0)
 
 
 def test_a_depth_that_a_file_cannot_hold_is_unknown_and_not_another_depth() -> None:
