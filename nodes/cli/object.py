@@ -151,7 +151,7 @@ def object_show(
         Path | None, typer.Option("--output", "-o", help="PNG.", show_default="beside FILE")
     ] = None,
 ) -> None:
-    """Render an object from eight sides."""
+    """Say what an object file holds, and render the object from eight sides."""
     import numpy as np
 
     from advnerf_core.data.image_files import write_image
@@ -163,6 +163,7 @@ def object_show(
     path = output or file.with_suffix(".png")
     refuse_overwriting([file], [path])
     model = load_object(file)
+    _print_facts(model)
     poses = ring(model.solid_box, _TURNTABLE_VIEWS)
     drawn = draw_object(model, poses, viewing_lens(_TURNTABLE_PIXELS))
     pictures = drawn[..., :3] + 1.0 - drawn[..., 3:]
@@ -173,12 +174,7 @@ def object_show(
     print(path)
 
 
-@app.command("info")
-def object_info(file: ObjectPath) -> None:
-    """Show the contents of an object file."""
-    from advnerf_core.objects.voxel.model import load_object
-
-    model = load_object(file)
+def _print_facts(model: ObjectModel) -> None:
     rows = table("what", "value")
     rows.add_row("name", model.name)
     rows.add_row("size", " x ".join(f"{side:.3f}" for side in model.size_m) + " m")
