@@ -7,17 +7,17 @@ from typing import Annotated
 
 import typer
 
-from nodes.runtime.terminal import FAILURE_EXIT, Overrides, fail_unless, print_findings, print_table, table
+from nodes.runtime.terminal import FAILURE_EXIT, Overrides, fail_unless, print_findings
 from nodes.runtime.termination import ends_in_order
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Places that are driven: which there are, installing those of other people, and whether one keeps the contract.",
+    help="Places that are driven: installing those of other people, and whether one keeps the contract.",
 )
 Name = Annotated[
     str,
     typer.Argument(
-        metavar="WORLD", help="A world of `advnerf scene world list`, or file.py:Class of your own."
+        metavar="WORLD", help="A world of `advnerf experiment list worlds`, or file.py:Class of your own."
     ),
 ]
 
@@ -51,30 +51,9 @@ def world_check(
     fail_unless(print_findings(findings))
 
 
-@app.command("list")
-def world_list() -> None:
-    """Name the worlds that there are: built in, and of installed packages; of simulators of other people, whether they are installed."""
-    from advnerf_core.plugins import known_names
-    from hardware.worlds import ENTRY_POINTS
-    from hardware.worlds.environments import ENVIRONMENTS
-    from nodes.lab.worlds.named import WORLDS
-
-    rows = table("", "", "")
-    for name in known_names(WORLDS, ENTRY_POINTS):
-        environment = ENVIRONMENTS.get(name)
-        if environment is None:
-            rows.add_row(name, "built in" if name in WORLDS else "of a package", "")
-        elif (state := environment.state) == "installed":
-            rows.add_row(name, state, str(environment.folder))
-        else:
-            rows.add_row(name, state, f"advnerf scene world install {name}")
-    rows.show_header = False
-    print_table(rows)
-
-
 @app.command("install")
 def world_install(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A world of `advnerf scene world list`.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A world of `advnerf experiment list worlds`.")],
     yes: Annotated[bool, typer.Option("--yes", help="Accept the licence without being asked.")] = False,
     python: Annotated[
         Path | None,

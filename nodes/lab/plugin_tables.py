@@ -57,9 +57,14 @@ def _methods() -> Mapping[str, str]:
 
 
 def _worlds() -> Mapping[str, str]:
+    from hardware.worlds.environments import ENVIRONMENTS
     from nodes.lab.worlds.named import WORLDS
 
-    return {name: one_line(load()) for name, load in WORLDS.items()}
+    lines = {name: one_line(load()) for name, load in WORLDS.items()}
+    for name, environment in ENVIRONMENTS.items():
+        if environment.state != "installed":  # also one of another lock file, which is not used
+            lines[name] += " (not installed)"
+    return lines
 
 
 def _cameras() -> Mapping[str, str]:

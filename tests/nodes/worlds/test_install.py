@@ -15,6 +15,7 @@ from hardware.worlds import WORLDS
 from hardware.worlds.environments import ENVIRONMENTS, FOLDER_VARIABLE, MADE, Environment
 from hardware.worlds.remote_errors import WorldNotInstalled
 from nodes.cli.main import app
+from nodes.lab.plugin_tables import TABLES, rows_of
 from nodes.lab.worlds.install import InstallError, find_python, install
 
 HERE = f"{sys.version_info[0]}.{sys.version_info[1]}"
@@ -101,15 +102,15 @@ def test_a_foreign_world_has_its_simulator_and_a_lock_of_pinned_versions(name: s
 def test_the_list_says_what_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     environment = ENVIRONMENTS["metadrive"]
-    listed = CliRunner().invoke(app, ["scene", "world", "list"]).output
-    assert "advnerf scene world install metadrive" in listed
+
+    def line() -> str:
+        return next(row.line for row in rows_of(TABLES["worlds"]) if row.name == "metadrive")
+
+    assert line().endswith(" (not installed)")
     environment.interpreter.parent.mkdir(parents=True)
     environment.interpreter.touch()
     (environment.folder / MADE).write_text(json.dumps({"lock_sha256": sha256_of(environment.lock)}))
-    assert (
-        "advnerf scene world install metadrive"
-        not in CliRunner().invoke(app, ["scene", "world", "list"]).output
-    )
+    assert "installed" not in line()
 
 
 def test_nothing_is_installed_before_its_licence_is_accepted(

@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from advnerf_core.documents import parse_yaml
 from nodes.cli.main import app
+from nodes.lab.plugin_tables import TABLES, rows_of
 from nodes.lab.worlds.named import WORLDS, NamedWorld, read_world, without
 from nodes.runtime.errors import ConfigError
 from tests.support.warehouse import EXAMPLES
@@ -114,9 +115,7 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with (tmp_path / "stranger_yard.py").open("a") as stream:
         stream.write("# edited\n")
     assert read(tmp_path, "{kind: yard, seed: 4}").settings["source_sha256"] != code
-    listed = CliRunner().invoke(app, ["scene", "world", "list"])
-    names = [line.split()[0] for line in listed.output.splitlines()]
-    assert names == [*WORLDS, "yard"]
+    assert [row.name for row in rows_of(TABLES["worlds"])] == [*WORLDS, "yard"]
     assert "scene" in WORLDS
 
 
