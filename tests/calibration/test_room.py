@@ -4,7 +4,7 @@ import pytest
 from advnerf_core.attack.artifact import face_texture
 from advnerf_core.driving.path import Arc, Line, Path
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.geometry import Pinhole, make_transform, planar_pose, rotation_z, transform_points
+from advnerf_core.geometry import make_transform, planar_pose, rotation_z, transform_points
 from calibration.degeneracy import DegenerateDataError
 from calibration.placement import face_frame, measured_pose, misplacement
 from calibration.room import (
@@ -151,13 +151,6 @@ def attack(T, size=1.0, subject="board"):
         T_world_from_object=T,
         subject=subject,
         corners_in_subject=np.zeros((4, 3)),
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="",
-        policy_sha256="",
-        config_sha256="",
-        seed=0,
-        predicted_total_cte_m=None,
-        software_version="0",
     )
 
 

@@ -145,7 +145,6 @@ def config_reader() -> tuple[Sequence[bytes], Callable[[bytes], None]]:
 def attack_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]:
     """An attack file's bytes: container, header and tensors."""
     from advnerf_core.attack.artifact import attack_from_bytes, face_texture, save_attack
-    from advnerf_core.geometry import Pinhole
     from tests.support.faces import face_attack
 
     theta = np.zeros((2, 2, 3), np.float32)
@@ -158,7 +157,6 @@ def attack_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None
         T_world_from_object=np.eye(4),
         subject="board",
         corners_in_subject=corners,
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
         scene_sha256="a" * 64,
         policy_sha256="b" * 64,
         config_sha256="c" * 64,

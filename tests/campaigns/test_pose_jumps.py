@@ -37,6 +37,7 @@ from nodes.vicon import ViconNode, ViconNodeConfig
 from tests.campaigns.campaign import Campaign
 from tests.support.faulty_devices import FaultyViconFrames
 from tests.support.live.processes import REPOSITORY
+from tests.support.messages import filled
 
 CALIBRATION = REPOSITORY / "calibration" / "twin"
 JUMPS_PER_H, CHUNK_H = 100, 0.5
@@ -170,31 +171,23 @@ class SimulatedDrive:
 
     def _vicon_status(self, now: Now) -> Any:
         fault = self._tracker.senders.faults(now.mono_ns)
-        return types.NodeStatus(
+        return filled(
+            types.NodeStatus,
             header=header(now.real_ns),
             node="vicon",
             pid=1,
             state="fault" if fault else "active",
             text=fault,
-            subscriptions=[],
-            publications=[],
-            subscribers=np.zeros(0, np.uint32),
-            counter_names=[],
-            counter_values=np.zeros(0),
         )
 
     def _telemetry(self, now: Now) -> Any:
-        return types.VescState(
+        return filled(
+            types.VescState,
             header=header(now.real_ns),
             speed_mps=self._gains.speed_mps(self._car.erpm),
             erpm=self._car.erpm,
-            duty=0.0,
             input_voltage_v=15.0,
-            motor_current_a=0.0,
-            input_current_a=0.0,
             mosfet_temperature_c=30.0,
-            fault=0,
-            fault_text="",
         )
 
     def _say(self, topic: str, message: Any, now: Now) -> None:

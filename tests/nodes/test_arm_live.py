@@ -22,6 +22,7 @@ from nodes.runtime.messages import drive_message, header, pose_message, types
 from nodes.runtime.paths import RESOLVED_NAME
 from nodes.runtime.requests import RequestIdentity
 from tests.support.disarm import ask_to_disarm
+from tests.support.messages import filled
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
@@ -104,17 +105,12 @@ class Lab:
 
 
 def sent(speed_mps, stamp_ns):
-    return types.MotorSent(
+    return filled(
+        types.MotorSent,
         header=header(stamp_ns),
-        serial_write_mono_ns=0,
-        serial_write_real_ns=0,
         speed_mps=speed_mps,
-        steering_rad=0.0,
-        erpm=0.0,
         servo=0.5,
-        brake_current_a=0.0,
         braking=speed_mps == 0.0,
-        reason="",
         peer="TWIN firmware 5.02",
     )
 

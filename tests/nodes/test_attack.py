@@ -25,6 +25,7 @@ from nodes.runtime.messages import decode, encode, header, image_message, pose_m
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.transfer import Assembler, FileSender, chunk_messages
+from tests.support.messages import filled
 from tests.support.tiny_request import loaded, tiny_request
 
 REPOSITORY = Path(__file__).parents[2]
@@ -59,7 +60,7 @@ class Bench:
     def request(self, text, request_id="a"):
         return self.send(
             "/attack/request",
-            types.AttackRequest(header=header(0), request_id=request_id, request=text, source="", ask_id=""),
+            filled(types.AttackRequest, request_id=request_id, request=text),
         )
 
     def cancel(self, request_id=""):

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from advnerf_core.attack.artifact import face_texture, save_attack
-from advnerf_core.geometry import Pinhole, make_transform, planar_pose, rotation_z
+from advnerf_core.geometry import make_transform, planar_pose, rotation_z
 from calibration.schema import TargetCalibration, load_calibration
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import decode, encode, image_message, pose_message
@@ -37,13 +37,8 @@ def attack(folder, seed):
         T_world_from_object=BOARD,
         subject="board",
         corners_in_subject=TARGET.corners,
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="",
-        policy_sha256="",
-        config_sha256="",
         seed=seed,
         predicted_total_cte_m=1.0,
-        software_version="0",
     )
     file = folder / f"{seed}.safetensors"
     return file, save_attack(file, made)

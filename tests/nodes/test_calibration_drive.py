@@ -8,26 +8,16 @@ from calibration.vehicle_response import fit_response
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.calibration_drive import CalibrationDrive, CalibrationDriveConfig, program
-from nodes.runtime.messages import header, image_message, ns_from_stamp, types
+from nodes.runtime.messages import image_message, ns_from_stamp, types
 from nodes.runtime.node import Now
+from tests.support.messages import filled
 
 CAR, PERIOD_S = CarConfig(), 0.1
 PIXEL = np.zeros((1, 1, 3), np.uint8)
 
 
 def state(armed, stopping=False):
-    return types.SafetyState(
-        header=header(0),
-        armed=armed,
-        stopping=stopping,
-        reason="",
-        source="operator",
-        command_age_s=0.0,
-        pose_age_s=0.0,
-        answered_id="",
-        granted=False,
-        answer="",
-    )
+    return filled(types.SafetyState, armed=armed, stopping=stopping, source="operator")
 
 
 def say(node, armed, t, stopping=False):

@@ -35,6 +35,7 @@ from nodes.runtime.errors import BagError
 from nodes.runtime.messages import encode, header, image_message, pose_message, types
 from tests.support.boards import BOARD
 from tests.support.drives import CAR, drive, program
+from tests.support.messages import filled
 
 START_NS = 1_800_000_000_000_000_000
 PINHOLE = LabConfig().camera.pinhole
@@ -66,17 +67,13 @@ def drive_bag(folder, recorded):
     with BagWriter(folder) as writer:
         write_poses(writer, "/vicon/car", recorded.pose_s, [planar_pose(*row) for row in recorded.poses])
         for k, t in enumerate(recorded.command_s):
-            sent = types.MotorSent(
+            sent = filled(
+                types.MotorSent,
                 header=header(ns(t - recorded.pipeline_s[k]), "car"),
                 serial_write_mono_ns=1,
                 serial_write_real_ns=ns(t),
-                speed_mps=0.0,
-                steering_rad=0.0,
                 erpm=float(recorded.erpm[k]),
                 servo=float(recorded.servo[k]),
-                brake_current_a=0.0,
-                braking=False,
-                reason="",
                 peer="twin",
             )
             writer.write("/motor/sent", encode(sent), ns(t), ns(t), k)

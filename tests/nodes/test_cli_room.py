@@ -13,7 +13,7 @@ import yaml
 
 from advnerf_core.attack.artifact import face_texture, save_attack
 from advnerf_core.driving.path import Path as DrivingPath
-from advnerf_core.geometry import Pinhole, make_transform, planar_pose, rotation_z
+from advnerf_core.geometry import make_transform, planar_pose, rotation_z
 from calibration.placement import face_frame
 from calibration.room import target_of_size
 from calibration.schema import RoomCalibration, TargetCalibration, load_calibration, save_calibration
@@ -106,13 +106,6 @@ def save_attack_at(folder, T):
         T_world_from_object=T,
         subject="board",
         corners_in_subject=FACE.corners,
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="",
-        policy_sha256="",
-        config_sha256="",
-        seed=0,
-        predicted_total_cte_m=None,
-        software_version="0",
     )
     save_attack(folder / "a.safetensors", attack)
     return folder / "a.safetensors"

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from advnerf_core.attack.artifact import AttackFileError, face_texture, save_attack
 from advnerf_core.attack.projection import FaceOverlay
-from advnerf_core.geometry import Pinhole, invert_transform, make_transform, planar_pose, rotation_z
+from advnerf_core.geometry import invert_transform, make_transform, planar_pose, rotation_z
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
 from nodes.compositor import CompositorConfig, CompositorNode
 from nodes.runtime.clock import ManualClock
@@ -40,13 +40,7 @@ def attack(**changes):
         "T_world_from_object": T_WORLD_FROM_BOARD,
         "subject": "board",
         "corners_in_subject": TARGET.corners,
-        "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        "scene_sha256": "",
-        "policy_sha256": "",
-        "config_sha256": "",
-        "seed": 0,
         "predicted_total_cte_m": 1.0,
-        "software_version": "0",
     }
     return face_attack(**{**values, **changes})
 

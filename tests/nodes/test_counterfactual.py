@@ -31,6 +31,7 @@ from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import decode, encode, header, image_message, pose_message, types
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.pictures import compressed_image_message
+from tests.support.messages import filled
 
 ROOT = Path(__file__).parents[2]
 TWIN = ROOT / "calibration" / "twin"
@@ -210,17 +211,8 @@ def drive(folder, policy):
 
         for ms in range(0, 2500, 20):
             armed = 100 <= ms < 2400
-            state = types.SafetyState(
-                header=header(START_NS + ms * MS),
-                armed=armed,
-                stopping=not armed,
-                reason="",
-                source="",
-                command_age_s=0.0,
-                pose_age_s=0.0,
-                answered_id="",
-                granted=False,
-                answer="",
+            state = filled(
+                types.SafetyState, header=header(START_NS + ms * MS), armed=armed, stopping=not armed
             )
             put("/safety/state", state, ms)
             put(

@@ -14,37 +14,31 @@ from nodes.lab.trials.trial import SpoiledError
 from nodes.lab.trials.tries import MOST_TRIES, NotDrivenError, allow_more_tries, drive_with_tries
 from nodes.runtime.messages import encode, header, pose_message, types
 from tests.nodes.test_arming import World
+from tests.support.messages import filled
 
 START_NS, TICK_S, TICKS = 1_700_000_000_000_000_000, 0.1, 60
 STALL = "stalled for 1.0 s: commanded 0.80 m/s, the car does not move"
 
 
 def sent(stamp_ns, age_s, braking=False):
-    return types.MotorSent(
+    return filled(
+        types.MotorSent,
         header=header(stamp_ns),
-        serial_write_mono_ns=0,
         serial_write_real_ns=stamp_ns + round(age_s * 1e9),
         speed_mps=0.8,
-        steering_rad=0.0,
-        erpm=0.0,
         servo=0.5,
-        brake_current_a=0.0,
         braking=braking,
-        reason="",
         peer="TWIN",
     )
 
 
 def status(node, real_ns, **counters):
-    return types.NodeStatus(
+    return filled(
+        types.NodeStatus,
         header=header(real_ns),
         node=node,
         pid=1,
         state="active",
-        text="",
-        subscriptions=[],
-        publications=[],
-        subscribers=np.zeros(0, np.uint32),
         counter_names=list(counters),
         counter_values=np.array(list(counters.values()), float),
     )

@@ -7,6 +7,7 @@ from advnerf_core.geometry import planar_pose
 from nodes.bags.writer import BagWriter
 from nodes.lab.trials.evaluation import attack_ids, frames, score, timing, trajectory
 from nodes.runtime.messages import drive_message, encode, header, image_message, pose_message, types
+from tests.support.messages import filled
 
 pytestmark = pytest.mark.live
 
@@ -38,17 +39,14 @@ def write_drive(folder, lost_frame=None, speed_mps=0.8):
         put("/compositor/attack", stamped, stamp + 12_000_000)
         put("/policy/drive", drive_message(0.8, 0.1, stamp), stamp + 20_000_000)
         put("/safety/drive", drive_message(0.8, 0.1, stamp), stamp + 21_000_000)
-        sent = types.MotorSent(
+        sent = filled(
+            types.MotorSent,
             header=header(stamp),
-            serial_write_mono_ns=0,
             serial_write_real_ns=stamp + 23_000_000,
             speed_mps=0.8,
             steering_rad=0.1,
-            erpm=0.0,
             servo=0.5,
-            brake_current_a=0.0,
             braking=k == lost_frame,
-            reason="",
             peer="TWIN",
         )
         put("/motor/sent", sent, stamp + 23_000_000)

@@ -13,9 +13,10 @@ from hardware.operator.hands import Hands
 from nodes.collect import Start
 from nodes.expert import Disturbance, ExpertNode, ExpertNodeConfig
 from nodes.runtime.clock import ManualClock
-from nodes.runtime.messages import header, pose_message, types
+from nodes.runtime.messages import pose_message, types
 from nodes.runtime.wire import MessageInfo
 from nodes.teleop import TeleopConfig, TeleopNode
+from tests.support.messages import filled
 
 PATH = DrivingPath.rounded_square(4.0, 1.1)
 T0 = 1_700_000_000_000_000_000
@@ -41,18 +42,7 @@ class Car:
             now = self.clock.now()
             info = MessageInfo(now.mono_ns, now.mono_ns, instance_id=1)
             if step % 10 == 0:
-                state = types.SafetyState(
-                    header=header(0),
-                    armed=self.armed,
-                    stopping=False,
-                    reason="",
-                    source="",
-                    command_age_s=0.0,
-                    pose_age_s=0.0,
-                    answered_id="",
-                    granted=False,
-                    answer="",
-                )
+                state = filled(types.SafetyState, armed=self.armed)
                 self.node.handle("/safety/state", state, info, now)
             pose = pose_message(planar_pose(self.x, self.y, self.yaw), now.real_ns)
             for topic, message in self.node.handle("/vicon/car", pose, info, now):
@@ -140,32 +130,16 @@ class Hand:
         return self.node.tick(self.clock.now())
 
     def brakes(self, braking):
-        sent = types.MotorSent(
-            header=header(0),
-            serial_write_mono_ns=0,
-            serial_write_real_ns=0,
-            speed_mps=0.0,
-            steering_rad=0.0,
-            erpm=0.0,
-            servo=0.5,
-            brake_current_a=0.0,
-            braking=braking,
-            reason="",
-            peer="TWIN",
-        )
+        sent = filled(types.MotorSent, servo=0.5, braking=braking, peer="TWIN")
         now = self.clock.now()
         self.node.handle("/motor/sent", sent, MessageInfo(now.mono_ns, now.mono_ns), now)
 
     def answer(self, ask_id, armed=True):
         now = self.clock.now()
-        state = types.SafetyState(
-            header=header(0),
+        state = filled(
+            types.SafetyState,
             armed=armed,
-            stopping=False,
-            reason="",
             source="operator",
-            command_age_s=0.0,
-            pose_age_s=0.0,
             answered_id=ask_id,
             granted=True,
             answer="armed",

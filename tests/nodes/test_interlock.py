@@ -7,6 +7,7 @@ import pytest
 
 from nodes.runtime.messages import decode, encode, header, types
 from nodes.runtime.wire import MessageInfo
+from tests.support.messages import filled
 
 pytestmark = pytest.mark.live
 
@@ -19,17 +20,11 @@ _SPEC.loader.exec_module(bench_of)
 
 
 def say(bench, armed):
-    state = types.SafetyState(
-        header=header(0),
+    state = filled(
+        types.SafetyState,
         armed=armed,
         stopping=not armed,
         reason="" if armed else "the car is outside the fence",
-        source="",
-        command_age_s=0.0,
-        pose_age_s=0.0,
-        answered_id="",
-        granted=False,
-        answer="",
     )
     now = bench.clock.now()
     info = MessageInfo(now.mono_ns, now.mono_ns, instance_id=1)

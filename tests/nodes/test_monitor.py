@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from advnerf_core.attack.artifact import face_texture, save_attack
-from advnerf_core.geometry import Pinhole
 from calibration.panel import MonitorPanel, make_panel, require_fits
 from calibration.schema import CalibrationError, TargetCalibration, load_calibration
 from hardware.emulators.monitor_port import MonitorPort
@@ -19,6 +18,7 @@ from nodes.runtime.messages import decode, encode, header, type_name, types
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.transfer import chunk_messages
 from tests.support.faces import centre_square, face_attack, outward_normal
+from tests.support.messages import filled
 
 pytestmark = pytest.mark.live
 
@@ -39,13 +39,8 @@ def attack(seed=0, **changes):
         "T_world_from_object": np.eye(4),
         "subject": "monitor",
         "corners_in_subject": SQUARE.corners,
-        "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        "scene_sha256": "",
-        "policy_sha256": "",
-        "config_sha256": "",
         "seed": seed,
         "predicted_total_cte_m": 1.0,
-        "software_version": "0",
     }
     return face_attack(**{**values, **changes})
 
@@ -81,18 +76,7 @@ class Screen:
     def safety(self, armed, reason=""):
         self.hear(
             "/safety/state",
-            types.SafetyState(
-                header=header(0),
-                armed=armed,
-                stopping=not armed,
-                reason=reason,
-                source="",
-                command_age_s=0.0,
-                pose_age_s=0.0,
-                answered_id="",
-                granted=False,
-                answer="",
-            ),
+            filled(types.SafetyState, armed=armed, stopping=not armed, reason=reason),
         )
 
     def pass_time(self, ms):

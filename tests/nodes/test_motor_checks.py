@@ -22,6 +22,7 @@ from nodes.runtime.messages import decode, encode, header, pose_message, types
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.twin_port import claim_twins_port, is_twin, is_twins_port
 from tests.support.faulty_devices import FaultyVescEmulator
+from tests.support.messages import filled
 from tests.support.safety_reports import state_message
 from tests.support.waiting import wait_for
 
@@ -167,9 +168,7 @@ def drive(car, speed):
     now = CLOCK.now()
     message = types.AckermannDriveStamped(
         header=header(now.real_ns),
-        drive=types.AckermannDrive(
-            steering_angle=0.0, steering_angle_velocity=0.0, speed=speed, acceleration=0.0, jerk=0.0
-        ),
+        drive=filled(types.AckermannDrive, speed=speed),
     )
     info = MessageInfo(now.mono_ns, now.mono_ns, instance_id=1)
     car.node.handle("/safety/state", state_message(now.real_ns, armed=speed != 0.0), info, now)

@@ -12,6 +12,7 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import BagError, NodeFinished
 from nodes.runtime.messages import decode, encode, header, pose_message, stamp_ns, types
+from tests.support.messages import filled
 
 pytestmark = pytest.mark.live
 
@@ -21,9 +22,7 @@ START_NS = 1_800_000_000_000_000_000
 @pytest.fixture
 def bag(tmp_path):
     """Two seconds: poses of the car at 50 Hz, of the board at 10 Hz, one request to arm, one status."""
-    arm = encode(
-        types.Arm(header=header(START_NS), arm=True, source="person", reason="", ask_id="", age_ns=0)
-    )
+    arm = encode(filled(types.Arm, header=header(START_NS), arm=True, source="person"))
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/arm", arm, START_NS, START_NS, 0)
         for i in range(100):
@@ -98,9 +97,7 @@ def test_any_subscriber_will_do_when_none_is_named(bag):
 
 def test_a_recording_does_not_ask_for_an_attack(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
-        request = encode(
-            types.AttackRequest(header=header(START_NS), request_id="a", request="", source="", ask_id="")
-        )
+        request = encode(filled(types.AttackRequest, header=header(START_NS), request_id="a"))
         cancel = encode(types.AttackCancel(header=header(START_NS), request_id="a", reason="", ask_id=""))
         for topic, data in (("/attack/request", request), ("/attack/cancel", cancel)):
             writer.write(topic, data, START_NS, START_NS, 0)

@@ -18,6 +18,7 @@ from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_me
 from nodes.runtime.node import MessageInfo
 from nodes.runtime.requests import RequestIdentity
 from nodes.safety import SafetyConfig, SafetyNode
+from tests.support.messages import filled
 
 pytestmark = pytest.mark.live
 
@@ -49,45 +50,17 @@ class Guard:
     def everything(self, peer="TWIN firmware 5.02", speed=0.8):
         stamp = self.now.real_ns
         for name in ("camera", "motor"):
-            status = types.NodeStatus(
-                header=header(stamp),
-                node=name,
-                pid=1,
-                state="ready",
-                text="",
-                subscriptions=[],
-                publications=[],
-                subscribers=np.zeros(0, np.uint32),
-                counter_names=[],
-                counter_values=np.zeros(0),
-            )
+            status = filled(types.NodeStatus, header=header(stamp), node=name, pid=1, state="ready")
             self.say(f"/status/{name}", status)
-        sent = types.MotorSent(
-            header=header(stamp),
-            serial_write_mono_ns=0,
-            serial_write_real_ns=0,
-            speed_mps=0.0,
-            steering_rad=0.0,
-            erpm=0.0,
-            servo=0.5,
-            brake_current_a=0.0,
-            braking=True,
-            reason="",
-            peer=peer,
-        )
+        sent = filled(types.MotorSent, header=header(stamp), servo=0.5, braking=True, peer=peer)
         self.say("/motor/sent", sent)
         self.say("/motor/state", self.telemetry())
-        info = types.CameraInfo(
+        info = filled(
+            types.CameraInfo,
             header=header(stamp),
             height=1,
             width=1,
-            distortion_model="",
             d=np.zeros(5),
-            k=np.zeros(9),
-            r=np.zeros(9),
-            p=np.zeros(12),
-            binning_x=0,
-            binning_y=0,
             roi=types.RegionOfInterest(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
         )
         self.say("/camera/camera_info", info)
@@ -95,17 +68,12 @@ class Guard:
         return self.say("/policy/drive", drive_message(speed, 0.1, stamp))
 
     def telemetry(self):
-        return types.VescState(
+        return filled(
+            types.VescState,
             header=header(self.now.real_ns),
             speed_mps=self.wheels,
-            erpm=0.0,
-            duty=0.0,
             input_voltage_v=15.0,
-            motor_current_a=0.0,
-            input_current_a=0.0,
             mosfet_temperature_c=30.0,
-            fault=0,
-            fault_text="",
         )
 
     def see_car(self, x=0.1, y=0.2, yaw=0.0):

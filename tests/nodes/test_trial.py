@@ -6,6 +6,7 @@ from nodes.lab.trials.trial import Phase, TrialError, TrialNode, TrialPlan
 from nodes.runtime.clock import Now
 from nodes.runtime.errors import NodeFinished
 from nodes.runtime.messages import header, pose_message, types
+from tests.support.messages import filled
 
 pytestmark = pytest.mark.live
 
@@ -42,17 +43,14 @@ class Stage:
         jitter = 1e-4 * np.sin(self.t_s * 1e3)
         T = planar_pose(self.pose[0] + jitter, self.pose[1], self.pose[2])
         self.hear("/vicon/car", pose_message(T, self.now.real_ns))
-        state = types.SafetyState(
+        state = filled(
+            types.SafetyState,
             header=header(self.now.real_ns),
             armed=self.armed,
             stopping=not self.armed,
             reason=self.reason,
-            source="",
-            command_age_s=0.0,
-            pose_age_s=0.0,
             answered_id=self.answered_id,
             granted=self.granted,
-            answer="",
         )
         self.hear("/safety/state", state)
         for topic, message in self.node.tick(self.now):
@@ -67,19 +65,7 @@ class Stage:
     def nodes_are_ready(self):
         for name in ("camera", "motor"):
             self.hear(f"/status/{name}", status(name, "active"))
-        sent = types.MotorSent(
-            header=header(0),
-            serial_write_mono_ns=0,
-            serial_write_real_ns=0,
-            speed_mps=0.0,
-            steering_rad=0.0,
-            erpm=0.0,
-            servo=0.5,
-            brake_current_a=0.0,
-            braking=True,
-            reason="",
-            peer=self.peer,
-        )
+        sent = filled(types.MotorSent, servo=0.5, braking=True, peer=self.peer)
         self.hear("/motor/sent", sent)
 
     def run_until(self, phase, limit_s=30.0):
@@ -90,16 +76,12 @@ class Stage:
 
 def status(node, state):
     none = np.zeros(0)
-    return types.NodeStatus(
-        header=header(0),
+    return filled(
+        types.NodeStatus,
         node=node,
         pid=1,
         state=state,
-        text="",
-        subscriptions=[],
-        publications=[],
         subscribers=none.astype(np.uint32),
-        counter_names=[],
         counter_values=none,
     )
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from advnerf_core.attack.artifact import face_texture, save_attack
 from advnerf_core.driving.path import Path as DrivingPath
-from advnerf_core.geometry import Pinhole, planar_pose
+from advnerf_core.geometry import planar_pose
 from benchmarks.host_pair import exchange_keys
 from calibration.schema import CalibrationError
 from nodes.bags.reader import read_messages
@@ -24,6 +24,7 @@ from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import encode, header, pose_message, types
 from tests.support.faces import face_attack
 from tests.support.live.processes import free_ports, free_udp_port
+from tests.support.messages import filled
 
 ROOT = Path(__file__).parents[2]
 LOOPBACK = "127.0.0.1"
@@ -64,13 +65,7 @@ def attack_file(folder, seed):
         T_world_from_object=np.eye(4),
         subject="board",
         corners_in_subject=np.array(corners),
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="",
-        policy_sha256="",
-        config_sha256="",
         seed=seed,
-        predicted_total_cte_m=None,
-        software_version="0",
     )
     save_attack(folder / f"{seed}.safetensors", attack)
     return folder / f"{seed}.safetensors", attack.attack_id
@@ -196,18 +191,7 @@ def write_bag(folder, drives, offset_m=0.1, rate_hz=100):
         stamp = START_NS + round(t * 1e9)
         put(
             "/safety/state",
-            types.SafetyState(
-                header=header(stamp),
-                armed=armed,
-                stopping=not armed,
-                reason=reason,
-                source="",
-                command_age_s=0.0,
-                pose_age_s=0.0,
-                answered_id="",
-                granted=False,
-                answer="",
-            ),
+            filled(types.SafetyState, header=header(stamp), armed=armed, stopping=not armed, reason=reason),
         )
 
     for stand_s, drive_s, reason in drives:

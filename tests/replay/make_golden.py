@@ -77,10 +77,6 @@ def attack_bytes(folder: Path) -> bytes:
         subject="board",
         corners_in_subject=np.array(CORNERS_M),
         camera=Pinhole(WIDTH, HEIGHT, 24.0, 24.0, 24.0, 13.5),
-        scene_sha256="",
-        policy_sha256="",
-        config_sha256="",
-        seed=0,
         predicted_total_cte_m=1.0,
         software_version="0",
     )

@@ -14,6 +14,7 @@ from nodes.runtime.messages import (
     types,
 )
 from nodes.runtime.topics import TOPICS
+from tests.support.messages import filled
 
 START_NS = 1_800_000_000_000_000_000
 
@@ -37,19 +38,11 @@ def sample(typename, stamp_ns):
         "advnerf_msgs/msg/Arm": lambda: types.Arm(
             header=h, arm=True, source="test", reason="because", ask_id="a", age_ns=1
         ),
-        "advnerf_msgs/msg/SafetyState": lambda: types.SafetyState(
-            header=h,
-            armed=True,
-            stopping=False,
-            reason="",
-            source="test",
-            command_age_s=0.1,
-            pose_age_s=0.01,
-            answered_id="",
-            granted=False,
-            answer="",
+        "advnerf_msgs/msg/SafetyState": lambda: filled(
+            types.SafetyState, header=h, armed=True, source="test", command_age_s=0.1, pose_age_s=0.01
         ),
-        "advnerf_msgs/msg/MotorSent": lambda: types.MotorSent(
+        "advnerf_msgs/msg/MotorSent": lambda: filled(
+            types.MotorSent,
             header=h,
             serial_write_mono_ns=1,
             serial_write_real_ns=2,
@@ -57,9 +50,6 @@ def sample(typename, stamp_ns):
             steering_rad=0.1,
             erpm=3691.0,
             servo=0.5,
-            brake_current_a=0.0,
-            braking=False,
-            reason="",
             peer="twin",
         ),
         "advnerf_msgs/msg/VescState": lambda: types.VescState(
@@ -80,12 +70,11 @@ def sample(typename, stamp_ns):
         "advnerf_msgs/msg/AttackCancel": lambda: types.AttackCancel(
             header=h, request_id="", reason="enough", ask_id="x"
         ),
-        "advnerf_msgs/msg/AttackProgress": lambda: types.AttackProgress(
+        "advnerf_msgs/msg/AttackProgress": lambda: filled(
+            types.AttackProgress,
             header=h,
             request_id="a",
             state="searching",
-            text="",
-            seed=0,
             evaluation=1,
             evaluations=2,
             loss_m=-1.0,
@@ -94,21 +83,18 @@ def sample(typename, stamp_ns):
             clean_total_cte_m=0.5,
             clean_drives=True,
             seconds=0.1,
-            attack_id="",
             answered_id="x",
         ),
         "advnerf_msgs/msg/FileChunk": lambda: types.FileChunk(
             header=h, name="a", sha256="ab", size_bytes=3, index=0, count=1, data=np.arange(3, dtype=np.uint8)
         ),
-        "advnerf_msgs/msg/NodeStatus": lambda: types.NodeStatus(
+        "advnerf_msgs/msg/NodeStatus": lambda: filled(
+            types.NodeStatus,
             header=h,
             node="x",
             pid=1,
             state="active",
-            text="",
             subscriptions=["/arm"],
-            publications=[],
-            subscribers=np.zeros(0, np.uint32),
             counter_names=["n"],
             counter_values=np.array([1.0]),
         ),

@@ -20,6 +20,15 @@ from calibration.panel import target_size
 from calibration.schema import TargetCalibration, load_calibration
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
+_OF_NO_SEARCH = {
+    "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32),
+    "scene_sha256": "",
+    "policy_sha256": "",
+    "config_sha256": "",
+    "seed": 0,
+    "predicted_total_cte_m": None,
+    "software_version": "0",
+}
 
 
 def face_attack(
@@ -34,14 +43,14 @@ def face_attack(
     sha256: str = "",
     **others: Any,
 ) -> AttackFile:
-    """The attack file of one face; ``others`` are its other attributes."""
+    """The attack file of one face; ``others`` are its other attributes, else those of no search."""
     carrier = AttackedObject(name, theta, T_world_from_object, 1.0, sha256)  # it refuses what has no texture
     shown = face_texture(theta) if texture is None else texture
     return AttackFile(
         space=COLOURS,
         objects=(carrier,),
         face=AttackFace(shown, size_m, subject, corners_in_subject),
-        **others,
+        **{**_OF_NO_SEARCH, **others},
     )
 
 
@@ -74,13 +83,6 @@ def red_attack(folder: Path, subject: str) -> tuple[AttackFile, Path]:
         T_world_from_object=np.eye(4),
         subject=subject,
         corners_in_subject=corners,
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="",
-        policy_sha256="",
-        config_sha256="",
-        seed=0,
-        predicted_total_cte_m=None,
-        software_version="0",
     )
     file = folder / "red.attack.safetensors"
     save_attack(file, attack)

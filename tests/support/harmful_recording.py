@@ -8,6 +8,7 @@ from advnerf_core.geometry import planar_pose
 from nodes.runtime.messages import decode, drive_message, encode, header, pose_message, types
 from nodes.runtime.topics import TOPICS
 from tests.support.bag_samples import sample
+from tests.support.messages import filled
 from tests.support.safety_reports import state_message
 from tests.support.virtual_stack import status_message, teleop_message
 
@@ -33,9 +34,7 @@ def recorded(topic: str, index: int, at_ns: int) -> bytes:
         "/motor/check": lambda: types.SteeringCheck(
             header=h, action=words[index % 3], source="", ask_id=f"c{index}"
         ),
-        "/clock/offset": lambda: types.ClockOffset(
-            header=h, peer="b", offset_s=0.0, error_s=0.0, round_trip_s=0.0
-        ),
+        "/clock/offset": lambda: filled(types.ClockOffset, header=h, peer="b"),
         "/motor/sent": lambda: _sent(at_ns),
         "/safety/drive": lambda: drive_message(0.8 if index % 10 >= 3 else 0.0, 0.1, at_ns),
         "/safety/state": lambda: state_message(at_ns, armed=index % 10 >= 3),

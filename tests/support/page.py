@@ -18,6 +18,7 @@ import yaml
 
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import drive_message, header, image_message, pose_message, types
+from tests.support.messages import filled
 from tests.support.waiting import wait_for
 
 REPOSITORY = Path(__file__).parents[2]
@@ -99,17 +100,13 @@ class Car(threading.Thread):
 
 def motor_sent(speed_mps, stamp_ns):
     """What a motor node reports that does what it is told."""
-    return types.MotorSent(
+    return filled(
+        types.MotorSent,
         header=header(stamp_ns),
-        serial_write_mono_ns=0,
         serial_write_real_ns=stamp_ns,
         speed_mps=speed_mps,
-        steering_rad=0.0,
-        erpm=0.0,
         servo=0.5,
-        brake_current_a=0.0,
         braking=speed_mps == 0.0,
-        reason="",
         peer="TWIN",
     )
 

@@ -5,19 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from nodes.runtime.messages import header, types
+from tests.support.messages import filled
 
 
 def state_message(stamp_ns: int, armed: bool, reason: str = "") -> Any:
     """A ``SafetyState`` that answers no request."""
-    return types.SafetyState(
-        header=header(stamp_ns),
-        armed=armed,
-        stopping=not armed,
-        reason=reason,
-        source="",
-        command_age_s=0.0,
-        pose_age_s=0.0,
-        answered_id="",
-        granted=False,
-        answer="",
-    )
+    return filled(types.SafetyState, header=header(stamp_ns), armed=armed, stopping=not armed, reason=reason)

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from advnerf_core.geometry import planar_pose
 from calibration.schema import VehicleCalibration, load_calibration
 from hardware.emulators.vesc_firmware import VescEmulatorConfig, VescFirmware, WireEvent
@@ -23,6 +21,7 @@ from nodes.runtime.messages import camera_info_message, drive_message, header, p
 from nodes.runtime.node import MessageInfo, Out
 from nodes.runtime.requests import RequestIdentity
 from nodes.safety import SafetyConfig, SafetyNode
+from tests.support.messages import filled
 from tests.support.stack import CALIBRATION
 
 MS, S = 10**6, 10**9
@@ -230,18 +229,7 @@ class VirtualStack:
 
 def status_message(name: str, state: str, text: str, stamp_ns: int) -> Any:
     """The status of a node."""
-    return types.NodeStatus(
-        header=header(stamp_ns),
-        node=name,
-        pid=1,
-        state=state,
-        text=text,
-        subscriptions=[],
-        publications=[],
-        subscribers=np.zeros(0, np.uint32),
-        counter_names=[],
-        counter_values=np.zeros(0),
-    )
+    return filled(types.NodeStatus, header=header(stamp_ns), node=name, pid=1, state=state, text=text)
 
 
 def teleop_message(mode: str, stamp_ns: int, speed_mps: float = 0.0, estop: bool = False) -> Any:

@@ -16,7 +16,7 @@ from advnerf_core.attack.printing.pages import pdf_bytes
 from advnerf_core.attack.printing.poster import Poster, PrintError, png_bytes, poster_of
 from advnerf_core.attack.printing.tiles import layout_of
 from advnerf_core.fields.voxel_grid import face_corners_in_object
-from advnerf_core.geometry import Pinhole, make_transform, rotation_z
+from advnerf_core.geometry import make_transform, rotation_z
 from tests.support.faces import face_attack
 
 POPPLER = pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="needs pdftoppm: poppler-utils")
@@ -33,7 +33,6 @@ def attack(**changes) -> AttackFile:
         subject="board",
         corners_in_subject=face_corners_in_object(0.5),
         T_world_from_object=POSE,
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
         scene_sha256="a" * 64,
         policy_sha256="b" * 64,
         config_sha256="c" * 64,

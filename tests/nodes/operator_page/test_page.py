@@ -376,7 +376,6 @@ def test_an_attack_is_chosen_and_switched_off(tmp_path):
     import numpy as np
 
     from advnerf_core.attack.artifact import attack_from_bytes, save_attack
-    from advnerf_core.geometry import Pinhole
     from nodes.runtime.transfer import Assembler
     from tests.support.faces import face_attack
 
@@ -388,13 +387,8 @@ def test_an_attack_is_chosen_and_switched_off(tmp_path):
         subject="board",
         corners_in_subject=np.zeros((4, 3)),
         T_world_from_object=np.eye(4),
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="",
-        policy_sha256="",
-        config_sha256="",
         seed=3,
         predicted_total_cte_m=12.5,
-        software_version="0",
     )
     save_attack(tmp_path / "strong.attack.safetensors", attack)
     run = Run(tmp_path, attacks=[str(tmp_path / "strong.attack.safetensors")])

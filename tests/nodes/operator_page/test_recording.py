@@ -6,22 +6,20 @@ import numpy as np
 import pytest
 
 from nodes.operator_page.recording import RECORDER, RecorderControl
-from nodes.runtime.messages import header, types
+from nodes.runtime.messages import types
+from tests.support.messages import filled
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
 
 
 def status(pid, received):
-    return types.NodeStatus(
-        header=header(0),
+    return filled(
+        types.NodeStatus,
         node=RECORDER,
         pid=pid,
         state="active",
-        text="",
         subscriptions=["/teleop/state"],
-        publications=[],
-        subscribers=np.zeros(0, np.uint32),
         counter_names=["received /teleop/state"],
         counter_values=np.array([received], np.float64),
     )

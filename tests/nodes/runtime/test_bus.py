@@ -13,6 +13,7 @@ from nodes.runtime.messages import stamp_ns as stamp_of
 from nodes.runtime.paths import bus_folder
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic
+from tests.support.messages import filled
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
@@ -119,7 +120,7 @@ def test_second_publisher_is_one_clear_error_and_the_endpoint_is_free_afterwards
 
 
 def request_to_stop(source):
-    return types.Arm(header=header(1), arm=False, source=source, reason="", ask_id="a", age_ns=0)
+    return filled(types.Arm, header=header(1), source=source, ask_id="a")
 
 
 def wait_with(condition, what, *buses):

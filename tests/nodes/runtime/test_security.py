@@ -19,6 +19,7 @@ from nodes.runtime.inbox import Inbox
 from nodes.runtime.messages import drive_message, encode, header, type_hash_prefix, types
 from nodes.runtime.wire import Meta, pack_meta
 from tests.support.live.processes import free_ports
+from tests.support.messages import filled
 from tests.support.waiting import wait_for
 
 ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
@@ -193,7 +194,7 @@ def test_watch_only_key_sees_but_cannot_drive_or_arm(lab, capfd):
     robot = lab.robot()
     visitor = lab.workstation("visitor", exports=("/policy/drive", "/arm"))
     robot.eyes.publisher("/vicon/car")
-    arm = types.Arm(header=header(0), arm=True, source="operator", reason="", ask_id="a", age_ns=0)
+    arm = filled(types.Arm, arm=True, source="operator", ask_id="a")
 
     def act():
         robot.eyes.publish("/vicon/car", encode(types.PoseStamped(header=header(0), pose=IDENTITY)))
