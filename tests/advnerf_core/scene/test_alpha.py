@@ -12,11 +12,12 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig, Samples
-from advnerf_core.scene.field import SceneField, SceneFieldConfig
+from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.torch_step import TorchStep, render_rays
 from advnerf_core.scene.train import TrainConfig, TrainedScene, Trainer, train_scene
 from advnerf_core.scene.train_step import CpuStep, Matte
+from tests.support.fields import random_field, random_samples
 
 GRID = HashGridConfig(levels=6, features=4, log2_entries=12, coarsest=8, finest=64)
 FIELD = SceneFieldConfig(
@@ -41,27 +42,19 @@ def some_batch(rays: int, seed: int) -> tuple[NDArray[np.float32], NDArray[np.ui
     rng = np.random.default_rng(seed)
     counts = rng.integers(0, 20, rays)
     counts[[0, -1]] = 0
-    begins = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    t = np.concatenate([np.sort(rng.uniform(0.1, 1.5, n)) for n in counts]).astype(np.float32)
-    points = rng.random((begins[-1], 3), dtype=np.float32)
-    widths = rng.uniform(0.01, 0.1, begins[-1]).astype(np.float32)
+    samples = random_samples(rng, counts)
     matte = Matte(rng.integers(0, 256, rays).astype(np.uint8), rng.random((rays, 3), dtype=np.float32))
     lines = rng.normal(size=(rays, 6)).astype(np.float32)
-    return lines, rng.integers(0, 256, (rays, 3)).astype(np.uint8), Samples(points, t, widths, begins), matte
-
-
-def some_scene(seed: int) -> SceneField:
-    scene, generator = SceneField(FIELD, seed=seed), torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for name, parameter in scene.named_parameters():
-            if name != "background":
-                parameter.normal_(0.0, 0.3, generator=generator)
-    return scene
+    return lines, rng.integers(0, 256, (rays, 3)).astype(np.uint8), samples, matte
 
 
 def test_both_steppers_give_the_gradient_of_the_definition() -> None:
     rays, targets, samples, matte = some_batch(300, 0)
-    kernels, plain, scene = CpuStep(some_scene(1), 0.1), TorchStep(some_scene(1), 0.1), some_scene(1)
+    kernels, plain, scene = (
+        CpuStep(random_field(FIELD, 1), 0.1),
+        TorchStep(random_field(FIELD, 1), 0.1),
+        random_field(FIELD, 1),
+    )
     packed, encoded = kernels.visible(samples, least_weight=0.0)
     first, second = (
         kernels.gradients(rays, targets, packed, encoded, matte),
@@ -95,7 +88,7 @@ def test_both_steppers_give_the_gradient_of_the_definition() -> None:
 def test_the_loss_vanishes_only_at_the_true_opacity() -> None:
     """Colours right everywhere: what is left is the opacity, by ``(opacity - alpha)^2`` times the spread of the colours behind."""
     rays, _, samples, matte = some_batch(4000, 2)
-    scene = some_scene(3)
+    scene = random_field(FIELD, 3)
     with torch.no_grad():
         colours, _, alpha = render_rays(scene, torch.from_numpy(rays), samples)
     exact = np.rint(255 * colours.numpy()).astype(np.uint8)

@@ -20,6 +20,7 @@ from advnerf_core.scene.torch_step import TorchStep, render_rays
 from advnerf_core.scene.train import CheckpointError, TrainConfig, TrainedScene, Trainer
 from advnerf_core.scene.train_step import CpuStep, Matte
 from tests.support.colour_room import CAMERA, room_images, room_poses, room_view
+from tests.support.fields import random_field, random_samples
 
 GRID = HashGridConfig(levels=6, features=4, log2_entries=12, coarsest=8, finest=96)
 FIELD = SceneFieldConfig((-1.05, -1.05, -0.55), (1.05, 1.05, 0.55), grid=GRID, hidden=16, features=7)
@@ -35,26 +36,9 @@ TRAIN = TrainConfig(
 )
 
 
-def some_scene(seed: int, field: SceneFieldConfig = FIELD) -> SceneField:
-    scene, generator = SceneField(field, seed=seed), torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for name, parameter in scene.named_parameters():
-            if name != "background" or field.learned_background:
-                parameter.normal_(0.0, 0.3, generator=generator)
-    return scene
-
-
 def some_batch(rays: int, seed: int) -> tuple[NDArray[np.float32], NDArray[np.uint8], Samples, RayGains]:
     rng = np.random.default_rng(seed)
-    counts = rng.integers(0, 20, rays)
-    begins = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    t = np.concatenate([np.sort(rng.uniform(0.1, 1.5, n)) for n in counts]).astype(np.float32)
-    samples = Samples(
-        rng.random((begins[-1], 3), dtype=np.float32),
-        t,
-        rng.uniform(0.01, 0.1, begins[-1]).astype(np.float32),
-        begins,
-    )
+    samples = random_samples(rng, rng.integers(0, 20, rays))
     targets = rng.integers(0, 256, (rays, 3)).astype(np.uint8)
     targets[::5] = 255  # cut off by the camera
     gains = np.exp(rng.normal(0.0, 0.5, (rays, 3))).astype(np.float32)
@@ -94,7 +78,7 @@ def test_gradients_of_the_gains_are_those_of_finite_differences(transparent: boo
     field = dataclasses.replace(FIELD, learned_background=not transparent)
     rays, targets, samples, exposure = some_batch(300, 0)
     matte = some_matte(300, 1) if transparent else None
-    kernels, plain = CpuStep(some_scene(1, field), 0.1), TorchStep(some_scene(1, field), 0.1)
+    kernels, plain = CpuStep(random_field(field, 1), 0.1), TorchStep(random_field(field, 1), 0.1)
     packed, encoded = kernels.visible(samples, least_weight=0.0)
     first = kernels.gradients(rays, targets, packed, encoded, matte, exposure)
     of_kernels = exposure.grad_log.copy()
@@ -103,13 +87,13 @@ def test_gradients_of_the_gains_are_those_of_finite_differences(transparent: boo
     logs = np.log(exposure.gains.astype(np.float64))
     step = 1e-6
     around = [
-        loss_of_each(some_scene(1, field), rays, targets, packed, logs + s, matte) for s in (step, -step)
+        loss_of_each(random_field(field, 1), rays, targets, packed, logs + s, matte) for s in (step, -step)
     ]
     expected = (around[0] - around[1]) / (2.0 * step)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(of_kernels, expected, atol=1e-4 * scale)
     np.testing.assert_allclose(exposure.grad_log, expected, atol=1e-4 * scale)
-    whole = loss_of_each(some_scene(1, field), rays, targets, packed, logs, matte).sum()
+    whole = loss_of_each(random_field(field, 1), rays, targets, packed, logs, matte).sum()
     assert first.loss == pytest.approx(whole, rel=1e-5)
     assert second.loss == pytest.approx(whole, rel=1e-5)
     for name, gradient in plain.grads.items():
@@ -120,7 +104,7 @@ def test_gradients_of_the_gains_are_those_of_finite_differences(transparent: boo
 def test_gains_of_one_change_nothing() -> None:
     rays, targets, samples, exposure = some_batch(300, 2)
     exposure.gains[...] = 1.0
-    with_gains, without = CpuStep(some_scene(3)), CpuStep(some_scene(3))
+    with_gains, without = CpuStep(random_field(FIELD, 3)), CpuStep(random_field(FIELD, 3))
     assert with_gains.step(rays, targets, samples, None, exposure).loss == pytest.approx(
         without.step(rays, targets, samples).loss, rel=1e-6
     )

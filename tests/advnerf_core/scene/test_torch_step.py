@@ -18,6 +18,7 @@ from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.torch_step import TorchStep, distortion_loss, render_rays
 from advnerf_core.scene.train import TrainConfig, Trainer
 from advnerf_core.scene.train_step import CpuStep
+from tests.support.fields import random_field, random_samples
 
 GRID = HashGridConfig(levels=4, features=4, log2_entries=10, coarsest=4, finest=32)
 FIELD = SceneFieldConfig((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), GRID, hidden=16, features=7, direction_bands=3)
@@ -25,10 +26,8 @@ CAMERA = Pinhole(16, 12, 12.0, 12.0, 8.0, 6.0)
 
 
 def some_scene(seed: int) -> SceneField:
-    scene, generator = SceneField(FIELD, seed=seed), torch.Generator().manual_seed(seed)
+    scene = random_field(FIELD, seed)
     with torch.no_grad():
-        for parameter in scene.parameters():
-            parameter.normal_(0.0, 0.3, generator=generator)
         scene.density_2.bias[0] = 1.5  # dense enough to hide what is behind
     return scene
 
@@ -38,12 +37,9 @@ def some_batch(rays: int = 200, seed: int = 0) -> tuple[NDArray[np.float32], NDA
     rng = np.random.default_rng(seed)
     counts = rng.integers(0, 31, rays)
     counts[[0, rays // 2, -1]] = 0
-    begins = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    t = np.concatenate([np.sort(rng.uniform(0.1, 1.5, n)) for n in counts]).astype(np.float32)
-    points = rng.random((begins[-1], 3), dtype=np.float32)
-    widths = rng.uniform(0.01, 0.2, begins[-1]).astype(np.float32)
+    samples = random_samples(rng, counts, widest=0.2)
     lines = rng.normal(size=(rays, 6)).astype(np.float32)
-    return lines, rng.integers(0, 256, (rays, 3)).astype(np.uint8), Samples(points, t, widths, begins)
+    return lines, rng.integers(0, 256, (rays, 3)).astype(np.uint8), samples
 
 
 def test_loss_gradients_and_updates_agree_with_the_kernels() -> None:

@@ -25,6 +25,7 @@ from advnerf_core.scene.torch_step import TorchStep, render_rays
 from advnerf_core.scene.train import TrainConfig, Trainer, train_scene
 from advnerf_core.scene.train_step import CpuStep, distortion_distances
 from tests.support.contraction import contract
+from tests.support.fields import random_field
 
 GRID = HashGridConfig(levels=6, features=4, log2_entries=13, coarsest=8, finest=192)
 FIELD = SceneFieldConfig(
@@ -34,14 +35,6 @@ MARCH = MarchConfig(near_m=0.05, smallest_step_m=0.01, largest_step_m=0.05, step
 WIDE = MarchConfig(near_m=0.05, smallest_step_m=0.03, largest_step_m=0.1, step_growth=0.06, max_samples=128)
 CAMERA = Pinhole(40, 30, 22.0, 22.0, 20.0, 15.0)
 RUNS = Path(__file__).resolve().parents[3] / "runs"
-
-
-def some_scene(seed: int, config: SceneFieldConfig = FIELD) -> SceneField:
-    scene, generator = SceneField(config, seed=seed), torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for parameter in scene.parameters():
-            parameter.normal_(0.0, 0.3, generator=generator)
-    return scene
 
 
 def some_rays(count: int, seed: int) -> tuple[NDArray[np.float32], Samples]:
@@ -73,8 +66,8 @@ def test_hand_written_gradients_agree_with_automatic_differentiation() -> None:
         "many samples lie outside the inner region"
     )
     targets = np.random.default_rng(2).integers(0, 256, (200, 3)).astype(np.uint8)
-    kernels = CpuStep(some_scene(3), 0.1, distortion=0.3, opacity=0.02)
-    plain = TorchStep(some_scene(3), 0.1, distortion=0.3, opacity=0.02)
+    kernels = CpuStep(random_field(FIELD, 3), 0.1, distortion=0.3, opacity=0.02)
+    plain = TorchStep(random_field(FIELD, 3), 0.1, distortion=0.3, opacity=0.02)
     first, second = kernels.step(rays, targets, samples), plain.step(rays, targets, samples)
     assert first.samples == second.samples
     assert second.loss == pytest.approx(first.loss, rel=1e-4)
@@ -87,7 +80,7 @@ def test_hand_written_gradients_agree_with_automatic_differentiation() -> None:
 
 
 def test_the_renderer_agrees_with_plain_torch_in_colour_and_planar_depth() -> None:
-    scene, rng = some_scene(4), np.random.default_rng(5)
+    scene, rng = random_field(FIELD, 4), np.random.default_rng(5)
     occupied = rng.random((32, 32, 32)) > 0.6
     T = look_at([0.3, -0.2, 0.1], [2.0, 1.0, 0.4])
     rgb, depth_m, alpha = FieldRenderer(scene, occupied, MARCH, least_transmittance=1e-4).render(
@@ -119,7 +112,7 @@ def test_a_baked_scene_looks_like_its_contracted_field(tmp_path: Path) -> None:
     """A smooth field that fills all space, so that what is seen lies on both sides of the inner region's border."""
     smooth = HashGridConfig(levels=3, features=4, log2_entries=13, coarsest=6, finest=14)
     config = dataclasses.replace(FIELD, grid=smooth, direction_bands=1)
-    scene = some_scene(4, config)
+    scene = random_field(config, 4)
     with torch.no_grad():
         scene.density_2.bias[0] = -0.3
         scene.colour_2.weight *= 3.0
