@@ -11,7 +11,6 @@ import numpy as np
 from advnerf_core.data.lens import Lens
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole
-from advnerf_core.plain import Numbers, PlainData
 
 Report = Callable[[float, str], None]
 MIN_IMAGES = 3
@@ -88,7 +87,7 @@ class Registered:
 
     name: str
     camera_id: str
-    T_world_from_camera: Numbers
+    T_world_from_camera: Array
     pinhole: Pinhole
     lens: Lens
 
@@ -147,7 +146,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True, eq=False)
-class Model(PlainData):
+class Model:
     """Result of structure from motion.
 
     Attributes:
@@ -161,7 +160,7 @@ class Model(PlainData):
 
     images: tuple[Registered, ...]
     left_out: tuple[LeftOut, ...]
-    points: Numbers
+    points: Array
     reprojection_error_px: float | None
     parts: int
     cameras: tuple[FoundCamera, ...] = ()

@@ -11,6 +11,7 @@ from PIL import Image
 from advnerf_core.data.image_files import image_size
 from advnerf_core.data.lens import Lens
 from advnerf_core.data.similarity import align_poses
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole, look_at
 from benchmarks.painted_corner import WALL_M, WALLS, photograph, poses_of, some_camera, write_photographs
 from calibration.photo_model import PhotoSource, ReconstructionError, SfmConfig
@@ -205,6 +206,12 @@ def test_a_process_of_colmap_that_is_killed_is_one_error(tmp_path):
 
     with pytest.raises(ReconstructionError, match=r"was ended by SIGKILL .* run the command again to resume"):
         reconstruct(tmp_path, [PhotoSource("photos", tuple(truth))], tmp_path / "work", report=kill)
+
+
+def test_an_error_of_the_system_in_that_process_is_one_of_ours(tmp_path):
+    with pytest.raises(AdvnerfError, match="No such file or directory") as caught:
+        reconstruct(tmp_path, [PhotoSource("phone", ("a.png", "b.png", "c.png"))], tmp_path / "work")
+    assert not isinstance(caught.value, ReconstructionError)
 
 
 def test_what_cannot_begin_is_refused_at_once(tmp_path):
