@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 
 Address = tuple[str, int]
 
-# Two senders within this time are two senders; a Tracker that is started again, with a new port, takes longer [s].
-HOLD_S = 1.0
+# Two senders within this time are two senders; a Tracker that is started again, with a new port, takes longer. A fault lasts as
+# long after it was last seen [ns].
+_HOLD_NS = 1_000_000_000
 # Number of frames whose measurements are kept, which is the largest delay of a datagram.
 _REMEMBERED_FRAMES = 64
 _MOST_SENDERS = 8
@@ -29,11 +30,9 @@ class SenderWatch:
 
     Args:
         subjects: Names to watch.
-        hold_s: A fault lasts until this long after it was last seen [s].
     """
 
-    def __init__(self, subjects: tuple[str, ...], hold_s: float = HOLD_S) -> None:
-        self._hold_ns = round(hold_s * 1e9)
+    def __init__(self, subjects: tuple[str, ...]) -> None:
         self._subjects = {name: _Subject() for name in subjects}
         # Replaced and never changed: another thread reads it.
         self._faults: dict[str, tuple[str, int]] = {}
@@ -65,7 +64,7 @@ class SenderWatch:
             if subject.sender != sender:
                 continue
             subject.frames.clear()
-            if silence_s < self._hold_ns / 1e9:
+            if silence_s < _HOLD_NS / 1e9:
                 self._blame(
                     name,
                     f"the frame numbers of {_text(sender)}, which sends subject {name}, went from {last} to {frame_number}"
@@ -76,15 +75,15 @@ class SenderWatch:
     def fault(self, name: str, mono_ns: int) -> str:
         """Return why a subject is unreliable; empty if it is reliable."""
         text, since_ns = self._faults.get(name, ("", 0))
-        return text if text and mono_ns - since_ns < self._hold_ns else ""
+        return text if text and mono_ns - since_ns < _HOLD_NS else ""
 
     def faults(self, mono_ns: int) -> str:
         """Return all faults in one line; empty if there are none. Any thread."""
-        texts = [text for text, since_ns in self._faults.values() if mono_ns - since_ns < self._hold_ns]
+        texts = [text for text, since_ns in self._faults.values() if mono_ns - since_ns < _HOLD_NS]
         return "; ".join(texts)
 
     def _look_for_others(self, name: str, subject: _Subject, mono_ns: int) -> None:
-        silent = [s for s, heard_ns in subject.senders.items() if mono_ns - heard_ns >= self._hold_ns]
+        silent = [s for s, heard_ns in subject.senders.items() if mono_ns - heard_ns >= _HOLD_NS]
         for sender in silent:
             del subject.senders[sender]
         while len(subject.senders) > _MOST_SENDERS:

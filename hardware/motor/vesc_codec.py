@@ -90,9 +90,8 @@ class FrameDecoder:
         skipped_bytes: Number of discarded bytes.
     """
 
-    def __init__(self, max_payload_bytes: int = MAX_PAYLOAD_BYTES) -> None:
+    def __init__(self) -> None:
         self._buffer = bytearray()
-        self._max_payload_bytes = max_payload_bytes
         self.skipped_bytes = 0
 
     def feed(self, data: bytes) -> list[bytes]:
@@ -147,7 +146,7 @@ class FrameDecoder:
         length = int.from_bytes(self._buffer[1:head_bytes], "big")
         # The long form of a short length is refused by the firmware too; 255 is accepted though never sent.
         smallest = 1 if start == START_SHORT else 255
-        return (head_bytes, length) if smallest <= length <= self._max_payload_bytes else None
+        return (head_bytes, length) if smallest <= length <= MAX_PAYLOAD_BYTES else None
 
 
 def encode_command(command: CommandId, value: float | None = None) -> bytes:

@@ -44,7 +44,6 @@ class V4l2Camera(Camera):
         skip_frames: Number of frames to skip after the start, which are damaged or badly exposed on many devices.
         port: System calls.
         started: Called with the file descriptor when the stream runs, for device-specific settings.
-        stamper: Converts and checks the kernel's stamps.
 
     Attributes:
         identity: Identity reported by the device, once it is open.
@@ -61,7 +60,6 @@ class V4l2Camera(Camera):
         skip_frames: int = 1,
         port: VideoPort | None = None,
         started: Callable[[int], None] | None = None,
-        stamper: Stamper | None = None,
     ) -> None:
         self.path = Path(path)
         self.mode = mode
@@ -73,7 +71,7 @@ class V4l2Camera(Camera):
         self._skip_frames = skip_frames
         self._port: VideoPort = port or KernelPort()
         self._started = started
-        self._stamper = stamper or Stamper()
+        self._stamper = Stamper()
         self._fd: int | None = None
         self._layout: PixelLayout | None = None
         self._maps: list[Any] = []
