@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.attack.artifact import save_attack
-from advnerf_core.geometry import Pinhole, make_transform, rotation_z
+from advnerf_core.geometry import make_transform, rotation_z
 from calibration.schema import TargetCalibration, load_calibration
 from tests.support.faces import face_attack
 from tests.support.live.page_browser import PHONE, Phone, available, live_page
@@ -31,13 +31,7 @@ def attack_file(path):
         subject="board",
         corners_in_subject=target.corners,
         T_world_from_object=make_transform(rotation_z(np.deg2rad(172)), [3.15, -1.75, 0.42]),
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="",
-        policy_sha256="",
-        config_sha256="",
-        seed=0,
         predicted_total_cte_m=9.9,
-        software_version="0",
     )
     save_attack(path, attack)
     return attack.attack_id
@@ -50,14 +44,6 @@ def lab(tmp_path_factory):
     with live_page(f"params.attacks=[{file}]", "page.trial_ticks=20") as operator:
         operator.attack_id = attack_id
         yield operator
-
-
-@pytest.fixture(scope="module")
-def playwright():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as running:
-        yield running
 
 
 @pytest.fixture

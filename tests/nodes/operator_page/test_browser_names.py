@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from tests.support.live.page_browser import PHONE, Phone, available
+from tests.support.live.page_browser import PHONE, Phone, available, says
 from tests.support.page import Run
 
 pytestmark = [
@@ -12,7 +12,6 @@ pytestmark = [
     pytest.mark.live,
     pytest.mark.skipif(not available(), reason="needs playwright and /usr/bin/chromium"),
 ]
-LONG_MS = 60_000
 
 
 @pytest.fixture
@@ -36,22 +35,6 @@ def phones(run, playwright):
     yield make
     for phone in made:
         phone.close()
-
-
-@pytest.fixture
-def playwright():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as running:
-        yield running
-
-
-def says(page, selector, words):
-    page.wait_for_function(
-        "([selector, words]) => document.querySelector(selector).innerText.includes(words)",
-        arg=[selector, words],
-        timeout=LONG_MS,
-    )
 
 
 def test_the_log_names_people(run, phones):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.support.live.page_browser import PHONE, Phone, available
+from tests.support.live.page_browser import LONG_MS, PHONE, Phone, available, says
 from tests.support.page import Run
 
 pytestmark = [
@@ -29,7 +29,6 @@ POOR_CONTRAST = """([root, least]) => {
       return [each.innerText, (high + 0.05) / (low + 0.05)];
     }).filter(([, contrast]) => contrast < least);
 }"""
-LONG_MS = 60_000
 
 
 @pytest.fixture(scope="module")
@@ -37,14 +36,6 @@ def run(tmp_path_factory):
     made = Run(tmp_path_factory.mktemp("run"))
     yield made.start()
     made.close()
-
-
-@pytest.fixture(scope="module")
-def playwright():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as running:
-        yield running
 
 
 @pytest.fixture
@@ -71,14 +62,6 @@ def colour(page, selector, what="backgroundColor"):
     """Red, green and blue of a part of the page."""
     text = page.evaluate(f"(selector) => getComputedStyle(document.querySelector(selector)).{what}", selector)
     return [int(part) for part in text.removeprefix("rgb(").removesuffix(")").split(",")]
-
-
-def says(page, selector, words):
-    page.wait_for_function(
-        "([selector, words]) => document.querySelector(selector).innerText.includes(words)",
-        arg=[selector, words],
-        timeout=LONG_MS,
-    )
 
 
 def test_the_age_of_a_picture_grows_and_the_picture_turns_grey(run, open_page):

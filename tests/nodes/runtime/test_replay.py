@@ -21,14 +21,10 @@ from nodes.runtime.errors import BagError, MessageError, NodeFinished
 from nodes.runtime.messages import decode, drive_message, encode, pose_message, stamp_ns, types
 from nodes.runtime.node import Node, Out
 from nodes.runtime.topics import topic as topic_row
+from tests.support.messages import filled
+from tests.support.replays import CORNER, GOLDEN_FOLDER, GREEN, MS, START_NS, pose, run
 
 pytestmark = pytest.mark.live
-
-START_NS = 1_800_000_000_000_000_000
-MS = 1_000_000
-GOLDEN_FOLDER = Path(__file__).parents[2] / "replay"
-CORNER = GOLDEN_FOLDER / "corner.mcap"
-GREEN = Choice(("compositor", "policy"), {"policy": "green_policy"})
 
 
 @pytest.fixture(autouse=True)
@@ -63,13 +59,6 @@ class Listener(Node):
 
     def handle(self, topic, message, info, now):
         return [Out("/safety/drive", info.raw)]
-
-
-def pose(ms, sequence=0, x=0.0):
-    T = np.eye(4)
-    T[0, 3] = x
-    ns = START_NS + ms * MS
-    return BagMessage("/vicon/car", encode(pose_message(T, ns)), ns, ns - MS, sequence)
 
 
 def lockstep(**nodes):
@@ -165,17 +154,9 @@ def test_nodes_that_answer_each_other_for_ever_are_stopped():
         def handle(self, topic, message, info, now):
             return [Out("/arm", info.raw)]
 
-    arm = types.Arm(
-        header=pose_message(np.eye(4), 0).header, arm=False, source="", reason="", ask_id="a", age_ns=0
-    )
+    arm = filled(types.Arm, header=pose_message(np.eye(4), 0).header, ask_id="a")
     with pytest.raises(BagError, match="answer each other endlessly on /arm"):
         lockstep(loop=Loop()).feed(BagMessage("/arm", encode(arm), START_NS, START_NS, 0))
-
-
-def run(choice=GREEN, bag=CORNER):
-    with Replay(bag, choice) as replay:
-        made = list(replay)
-        return made, replay.summary
 
 
 def test_ten_replays_have_one_digest_and_the_nodes_see_what_a_bench_by_hand_sees():

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,32 +14,14 @@ from nodes.replaying.golden import Golden, Tolerances, compare
 from nodes.replaying.nodes import Choice
 from nodes.replaying.replay import Replay, write_replay
 from nodes.runtime.errors import BagError, ConfigError
-from nodes.runtime.messages import decode, drive_message, encode, pose_message, type_name
+from nodes.runtime.messages import decode, drive_message, encode, type_name
 from nodes.runtime.topics import topic as topic_row
-
-START_NS = 1_800_000_000_000_000_000
-MS = 1_000_000
-GOLDEN_FOLDER = Path(__file__).parents[2] / "replay"
-CORNER = GOLDEN_FOLDER / "corner.mcap"
-GREEN = Choice(("compositor", "policy"), {"policy": "green_policy"})
+from tests.support.replays import CORNER, GOLDEN_FOLDER, GREEN, START_NS, pose, run
 
 
 @pytest.fixture(autouse=True)
 def _green_policy_is_found(monkeypatch):
     monkeypatch.syspath_prepend(str(GOLDEN_FOLDER))
-
-
-def pose(ms, sequence=0, x=0.0):
-    T = np.eye(4)
-    T[0, 3] = x
-    ns = START_NS + ms * MS
-    return BagMessage("/vicon/car", encode(pose_message(T, ns)), ns, ns - MS, sequence)
-
-
-def run(choice=GREEN, bag=CORNER):
-    with Replay(bag, choice) as replay:
-        made = list(replay)
-        return made, replay.summary
 
 
 @pytest.fixture(scope="module")

@@ -26,6 +26,7 @@ PHONE = {
     "is_mobile": True,
     "has_touch": True,
 }
+LONG_MS = 60_000
 # Not the default, so that it does not meet a lab that is running.
 _VICON_PORT = 51088
 
@@ -35,6 +36,15 @@ def available() -> bool:
     from importlib.util import find_spec
 
     return CHROMIUM.exists() and find_spec("playwright") is not None
+
+
+def says(page: Any, selector: str, words: str) -> None:
+    """Wait until a part of the page has these words."""
+    page.wait_for_function(
+        "([selector, words]) => document.querySelector(selector).innerText.includes(words)",
+        arg=[selector, words],
+        timeout=LONG_MS,
+    )
 
 
 @contextlib.contextmanager
