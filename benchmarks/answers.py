@@ -161,13 +161,14 @@ def _transfers(sets: Sequence[Mapping[str, Any]], about: Mapping[str, SetAbout])
 
 def _claimed(sets: Sequence[Mapping[str, Any]]) -> str:
     """What claims over places and victims say, also where the attack does nothing."""
-    return "".join(
-        f" Over {sample_of(claim)} of {found['name']} it adds {claim['difference_m']:+.3f} m per tick to the strongest baseline "
-        f"(95 % {ends(claim['low_m'], claim['high_m'])}) and {claim['off_track_points']:+.0f} points of drives off the track."
+    said = [
+        f"{found['name']} {claim['difference_m']:+.3f} m (95 % {ends(claim['low_m'], claim['high_m'])}), {claim['off_track_points']:+.0f} points of drives "
+        f"off the track ({sample_of(claim)})"
         for found in sets
         for claim in found.get("claims", ())
         if claim["difference_m"] is not None
-    )
+    ]
+    return f" It adds to the strongest baseline, per tick: {'; '.join(said)}." if said else ""
 
 
 def _counts(sets: Sequence[Mapping[str, Any]], about: Mapping[str, SetAbout]) -> str:
