@@ -96,7 +96,9 @@ def write_maps(evidence: Evidence, maps: Sequence[Sequence[Mapping[str, Any]]], 
             ax = figure.add_axes((left, 0.36, width, 0.46))
             _draw_map(ax, groups, registered.reference_path(), registered.off_track_m, None)
             ax.set_title(scenario.replace("_", " "), pad=20 * len(groups))
-            ax.legend(handles=_handles(groups), loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
+            small = {"fontsize": 7.0, "handlelength": 1.2} if len(maps) > 3 else {}
+            above = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "frameon": False}
+            ax.legend(handles=_handles(groups), **above, **small)
             below = figure.add_axes((left, 0.085, width, 0.15))
             _draw_deviation(below, groups, registered.off_track_m, registered.dt_s)
             if number:  # said once for the row
