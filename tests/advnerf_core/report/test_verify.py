@@ -133,6 +133,35 @@ def test_a_registered_cell_has_the_registered_settings(original):
         assert found[0].endswith(says)
 
 
+def test_a_victim_with_a_recipe_of_its_own_has_the_settings_of_that(original):
+    evidence = evidence_of(original)
+    shared = {"policy": {"stiffness_1pm": 0.75, "seed": 0}, "architecture": {"hidden": [100, 50, 10]}}
+    own = {"stiffness_1pm": 1.6, "seed": 0, "architecture": "resnet"}
+    scenarios = {
+        name: each.model_copy(update={"settings": {**shared, "recipes": {"hardened": own}}})
+        for name, each in evidence.registration.scenarios.items()
+    }
+    registration = evidence.registration.model_copy(update={"scenarios": scenarios})
+    theirs = {"policy": {"stiffness_1pm": 1.6, "seed": 0}, "architecture": {"architecture": "resnet"}}
+
+    def problems(of_hardened):
+        cells = [
+            cell.model_copy(
+                update={
+                    "registration": registration.digest,
+                    "settings": of_hardened if cell.victim == "hardened" else shared,
+                }
+            )
+            for cell in evidence.all_cells
+        ]
+        return list(cell_problems(Evidence(registration, cells), read_withdrawn(original)))
+
+    assert problems(theirs) == []
+    assert (
+        "got policy.stiffness_1pm 0.75 instead of 1.6" in problems({**theirs, "policy": shared["policy"]})[0]
+    )
+
+
 def no_poses(data):
     data["kept"]["deployed"][0].update(x_m="", y_m="", yaw_rad="")
 

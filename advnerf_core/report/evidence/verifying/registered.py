@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from datetime import datetime
+from typing import Any
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
-from advnerf_core.report.evidence.registration import settings_differences
+from advnerf_core.report.evidence.registration import RegisteredScenario, settings_differences
 from advnerf_core.report.evidence.results import Evidence
 
 
@@ -56,7 +57,7 @@ def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
             yield f"{cell.name}: expected {key} {value} as registered, got {found}"
     if bool(scenario.settings) > bool(cell.settings):
         yield f"{cell.name}: expected its settings, as the registration has them, got none"
-    for text in settings_differences(scenario.settings, cell.settings):
+    for text in settings_differences(_settings_of(scenario, cell.victim), cell.settings):
         yield f"{cell.name}: expected the registered settings, got {text}"
     clip = str(cell.extra.get("clip") or cell.name)
     if not clip.startswith(cell.name):
@@ -64,6 +65,16 @@ def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
     registered = evidence.registration.date
     if not _not_before(cell.date, registered):
         yield f"{cell.name}: expected a date from {registered} on, when it was registered, got {cell.date}"
+
+
+def _settings_of(scenario: RegisteredScenario, victim: str) -> Mapping[str, Any]:
+    """The registered settings of a victim's cells: one with a recipe of its own has its own training and architecture."""
+    recipe = scenario.settings.get("recipes", {}).get(victim)
+    if recipe is None:
+        return scenario.settings
+    policy = {name: recipe[name] for name in scenario.settings["policy"]}
+    architecture = {name: value for name, value in recipe.items() if name not in policy}
+    return {**scenario.settings, "policy": policy, "architecture": architecture}
 
 
 def _not_before(date: str, other: str) -> bool:
