@@ -18,6 +18,7 @@ KEPT_COMMANDS: dict[str, re.Pattern[str]] = {
     "predictions": re.compile(r"python -m benchmarks\.predictions"),
     "paper": re.compile(r"python -m benchmarks\.paper_table"),
     "correlation": re.compile(r"python -m benchmarks\.transfer_correlation"),
+    "panel": re.compile(r"python -m benchmarks\.victim_panel"),
 }
 NOT_KEPT = "Measured once, not kept."
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.report.evidence.verifying.numbers import same
-from benchmarks import gap, paper_table, predictions, retraining, transfer_correlation
+from benchmarks import gap, paper_table, predictions, retraining, transfer_correlation, victim_panel
 from benchmarks.kept_commands import kept_by
 from benchmarks.results import REPOSITORY, LedgerRow
 from nodes.experiment.steps.run import load_experiment
@@ -35,6 +35,7 @@ _AGAIN: dict[str, Callable[..., list[LedgerRow]]] = {
     "predictions": predictions.ledger_rows,
     "paper": paper_table.ledger_rows,
     "correlation": transfer_correlation.ledger_rows,
+    "panel": victim_panel.ledger_rows,
 }
 
 

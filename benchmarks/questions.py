@@ -147,7 +147,7 @@ QUESTIONS = (
         "paper_table",
         "What does the paper's table say on one build?",
         "The registered sets of the paper's own experiments, and what its assumptions about the lab are worth.",
-        ("paper_table",),
+        ("paper_table", "victim_panel"),
         picture="paper_junction_above.webp",
     ),
     Question(

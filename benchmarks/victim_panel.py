@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
 from advnerf_core.report.evidence.families import GRADIENT
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes, write_png
-from benchmarks.results import REPOSITORY, record_row
+from benchmarks.results import REPOSITORY, LedgerRow
 from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench
@@ -29,9 +30,9 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.deploy import drive_through_world
 from nodes.experiment.steps.run import prepare_victims
 
-_KEPT = REPOSITORY / "docs" / "results" / "victim_panel_matrix"
+KEPT = REPOSITORY / "docs" / "results" / "victim_panel_drives.json"
 _PICTURE = REPOSITORY / "docs" / "victim_panel.png"
-_FILE = "matrix.json"
+COMMAND = "python -m benchmarks.victim_panel"
 
 
 def drives_of(experiment: Experiment) -> dict[str, Any]:
@@ -82,6 +83,32 @@ def share_kept(excess: Array) -> float:
     return float(others.mean() / own.mean())
 
 
+def rows_of(found: Mapping[str, Any]) -> list[LedgerRow]:
+    """What its own attack does to each victim, and what those on others do."""
+    excess, off, names = excess_m(found), off_track(found), found["victims"]
+    starts = len(found["none"][0]["total_cte_m"])
+    of = f"green screen, one search of the gradient, {starts} starts, deployed"
+    rows = []
+    for at, name in enumerate(names):
+        others = np.delete(excess[:, at], at)
+        note = (
+            f"{of}; {100 * off[at, at]:.0f} % of its drives off the track; past the attacks on others {others.min():.3f} to "
+            f"{others.max():.3f} m"
+        )
+        line = f"panel of victims, {name}: excess past the attack on it"
+        rows.append(LedgerRow(line, round(float(excess[at, at]), 3), "m per tick", "", None, COMMAND, note))
+    line = "panel of victims: excess past an attack on another victim over that past the own one"
+    return [
+        *rows,
+        LedgerRow(line, round(share_kept(excess), 3), "x", "", None, COMMAND, f"{len(names)} victims, {of}"),
+    ]
+
+
+def ledger_rows() -> list[LedgerRow]:
+    """The rows of the kept drives."""
+    return rows_of(read_json(KEPT))
+
+
 def picture(victims: Sequence[str], excess: Array, off: Array) -> Figure:
     """The matrix: excess in colour, and in each field the excess and the share of drives off the track."""
     size = 1.6 + 0.85 * len(victims)
@@ -100,33 +127,19 @@ def picture(victims: Sequence[str], excess: Array, off: Array) -> Figure:
 
 
 def main() -> None:
-    """Drive, record the rows, and put numbers and picture into docs/."""
+    """Drive, or read what was driven, record the rows, and put numbers and picture into docs/."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("folder", type=Path, help="run folder of the finished experiment")
-    parser.add_argument("--dry", action="store_true", help="print only")
-    options = parser.parse_args()
-    experiment = Experiment.resolved_in(options.folder.resolve())
-    found = drives_of(experiment)
-    excess, off = excess_m(found), off_track(found)
-    starts, names = len(found["none"][0]["total_cte_m"]), found["victims"]
-    print("\n".join([str(names), str(excess.round(3)), str(off.round(2))]))
-    if options.dry:
-        return
-    write_atomically(_KEPT / _FILE, json.dumps(found) + "\n")
-    write_png(picture(names, excess, off), _PICTURE, dpi=110)
-    record_row(
-        "panel of victims: excess past an attack on another victim over that past the own one",
-        round(share_kept(excess), 3),
-        "x",
-        "",
-        None,
-        f"python -m benchmarks.victim_panel {options.folder}",
-        f"{len(names)} victims, green screen, one search each, {starts} starts, deployed; own: "
-        + ", ".join(
-            f"{name} {value:.2f} m ({100 * share:.0f} % off track)"
-            for name, value, share in zip(names, np.diag(excess), np.diag(off), strict=True)
-        ),
+    parser.add_argument(
+        "folder", type=Path, nargs="?", help="run folder of the searches; without one: the kept drives"
     )
+    folder = parser.parse_args().folder
+    if folder is not None:
+        write_atomically(KEPT, json.dumps(drives_of(Experiment.resolved_in(folder.resolve()))) + "\n")
+    found = read_json(KEPT)
+    for row in ledger_rows():
+        row.record()
+        print(f"{row.line}: {row.value} {row.unit}; {row.note}")
+    write_png(picture(found["victims"], excess_m(found), off_track(found)), _PICTURE, dpi=110)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.victim_panel import excess_m, off_track, picture, share_kept
+from benchmarks.victim_panel import excess_m, off_track, picture, rows_of, share_kept
 
 
 def drives(totals, off):
@@ -24,5 +24,8 @@ def test_rows_are_attacked_and_columns_driven_victims():
     assert excess == pytest.approx(np.array([[1.0, 0.3], [0.2, 0.5]]))
     assert off_track(FOUND).tolist() == [[1.0, 0.0], [0.0, 0.5]]
     assert share_kept(excess) == pytest.approx((0.3 + 0.2) / (1.0 + 0.5))
+    soft, stiff, others = rows_of(FOUND)
+    assert (soft.value, stiff.value, others.value) == (1.0, 0.5, 0.333)
+    assert "50 % of its drives off the track; past the attacks on others 0.300 to 0.300 m" in stiff.note
     texts = {text.get_text() for text in picture(FOUND["victims"], excess, off_track(FOUND)).axes[0].texts}
     assert texts == {"1.00\n100 %", "0.30\n0 %", "0.20\n0 %", "0.50\n50 %"}
