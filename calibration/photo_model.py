@@ -11,6 +11,7 @@ import numpy as np
 from advnerf_core.data.lens import Lens
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.plain import Numbers, PlainData
 
 Report = Callable[[float, str], None]
 MIN_IMAGES = 3
@@ -87,7 +88,7 @@ class Registered:
 
     name: str
     camera_id: str
-    T_world_from_camera: Array
+    T_world_from_camera: Numbers
     pinhole: Pinhole
     lens: Lens
 
@@ -146,7 +147,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class Model(PlainData):
     """Result of structure from motion.
 
     Attributes:
@@ -160,7 +161,7 @@ class Model:
 
     images: tuple[Registered, ...]
     left_out: tuple[LeftOut, ...]
-    points: Array
+    points: Numbers
     reprojection_error_px: float | None
     parts: int
     cameras: tuple[FoundCamera, ...] = ()

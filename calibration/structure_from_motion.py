@@ -8,15 +8,13 @@ CPU, in a separate process: COLMAP takes over the process's signals, and one cal
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from advnerf_core.errors import AdvnerfError
 from advnerf_core.run_module import module_command
+from calibration.colmap_messages import pack_job, unpack_answer
 from calibration.photo_model import (
     MIN_IMAGES,
     Model,
@@ -63,8 +61,7 @@ def reconstruct(
             start_new_session=True,
         )
         try:
-            job = root.absolute(), tuple(sources), work.absolute(), config
-            model = _converse(process, job, report)
+            model = _converse(process, pack_job(root.absolute(), sources, work.absolute(), config), report)
         finally:
             process.kill()
             process.communicate()
@@ -82,27 +79,23 @@ def _require_colmap() -> None:
         raise ModuleNotFoundError("No module named 'pycolmap'", name="pycolmap")
 
 
-def _converse(process: subprocess.Popen[bytes], job: tuple[Any, ...], report: Report) -> Model | None:
+def _converse(process: subprocess.Popen[bytes], job: bytes, report: Report) -> Model | None:
     """Hand over the job and follow its progress; returns the model, or None if the process ended without one."""
     assert process.stdin is not None
     assert process.stdout is not None
     try:
-        pickle.dump(job, process.stdin)
+        process.stdin.write(job)
         process.stdin.flush()
     except BrokenPipeError:
         pass  # it has ended; its earlier output, if any, has the reason
-    while True:
-        try:
-            answer = pickle.load(process.stdout)
-        except (EOFError, pickle.UnpicklingError):  # it has ended, perhaps within an answer
-            process.wait()
-            return None
-        if isinstance(answer, AdvnerfError):
-            raise answer
+    while (line := process.stdout.readline()).endswith(b"\n"):
+        answer = unpack_answer(line)
         if isinstance(answer, Model):
             process.wait()
             return answer
         report(*answer)
+    process.wait()
+    return None
 
 
 def _ended_early(code: int, log: Path) -> Exception:

@@ -21,6 +21,7 @@ METHODS = {"model_validate_json", "validate_json"}
 WIRE = {
     "hardware/worlds/remote.py": 1,  # replies of a world's server
     "hardware/worlds/servers/serve.py": 1,  # runs in the server's own environment
+    "calibration/colmap_messages.py": 2,  # lines of our COLMAP process
     "nodes/experiment/run/worker.py": 1,  # a job on standard input
     "nodes/experiment/node/job.py": 1,  # lines of a search process
     "nodes/lab/doctor/check.py": 1,  # a probe's answer
