@@ -1,13 +1,18 @@
 """The drive of the recorded victim: ``python -m nodes.lab.recorded_drive FOLDER`` writes pictures, a film and their description.
 
-It is driven in the simulated lab, without torch.
+It is driven through live nodes on the twin. Where these cannot run, or did not get the time that a live drive needs, it is driven in the
+simulated lab in this process. Neither imports torch.
 """
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,17 +21,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.attack.artifact import load_attack
-from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
+from advnerf_core.driving.metrics import DriveMetrics, Horizon
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_json
 from advnerf_core.geometry import Array, invert_transform
 from advnerf_core.policies.load import load_driver
 from calibration.schema import CameraCalibration, RoomCalibration, TargetCalibration, load_calibration
 from nodes.lab.recorded_victim import ABOUT, FILM, FOLDER, LABEL, NOW, RecordedVictim, find_recorded
+from nodes.lab.trials.evaluation import frames, score, trajectory
+from nodes.lab.trials.trial import TrialPlan
+from nodes.lab.trials.trial_runner import LIVE_LOCK, TrialNodes
+from nodes.runtime.bus import Bus
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import MessageError
+from nodes.runtime.locks import hold
 from nodes.runtime.paths import shipped
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.termination import ends_in_order
 
+_SEEN = "/compositor/image"
+_NODES = ("twin", "camera", "vicon", "compositor", "policy", "safety", "motor")
 _HORIZON = Horizon(60)
 _SPEED_MPS = 0.8
+_READY_S = 30.0
+_VICON_PORT = 51177
 
 Rgb = NDArray[np.uint8]
 Show = Callable[[Rgb], None]
@@ -39,11 +57,13 @@ class Driven:
     Attributes:
         states: States at the ticks ``[T + 1, 3]``: x [m], y [m], yaw [rad].
         pictures: What the policy saw, ``[T + 1, H, W, 3]``.
+        where: What drove, in words.
     """
 
     states: Array
     pictures: Rgb
     metrics: DriveMetrics
+    where: str
 
 
 def drive_recorded(victim: RecordedVictim, folder: Path, say: Callable[[str], None]) -> Path:
@@ -56,13 +76,19 @@ def drive_recorded(victim: RecordedVictim, folder: Path, say: Callable[[str], No
         The film.
     """
     began_s = time.monotonic()
+    shutil.rmtree(folder / "drive", ignore_errors=True)
     say(f"{LABEL} It drives past the texture now.")
     _describe(folder, "It drives past the texture now.", NOW, film=False)
-    driven = _drive(victim, _picture_writer(folder / NOW))
+    show = _picture_writer(folder / NOW)
+    try:
+        driven = _through_nodes(victim, folder, show)
+    except AdvnerfError as error:
+        print(f"not driven live: {error}", file=sys.stderr)
+        driven = _in_the_lab(victim, show)
     film = _film(victim, driven, folder)
     left_s = driven.metrics.time_to_leaving_s
     how = "stays in its lane" if left_s is None else f"leaves its lane after {left_s:.1f} s"
-    text = f"In the simulated lab, it {how}: total CTE {driven.metrics.total_cte_m:.1f} m in {_HORIZON.ticks * _HORIZON.dt_s:.0f} s."
+    text = f"{driven.where}, it {how}: total CTE {driven.metrics.total_cte_m:.1f} m in {_HORIZON.ticks * _HORIZON.dt_s:.0f} s."
     _describe(folder, text, film.name, film=True)
     say(f"{LABEL} {text} Film after {time.monotonic() - began_s:.0f} s: {film}")
     return film
@@ -75,7 +101,7 @@ def _describe(folder: Path, text: str, file: str, film: bool) -> None:
 def _picture_writer(file: Path) -> Show:
     def show(rgb: Rgb) -> None:
         _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-        # Replaced without waiting for the disk.
+        # Replaced without waiting for the disk, which live nodes need too.
         part = file.with_suffix(".part")
         part.write_bytes(jpeg.tobytes())
         part.replace(file)
@@ -83,7 +109,51 @@ def _picture_writer(file: Path) -> Show:
     return show
 
 
-def _drive(victim: RecordedVictim, show: Show) -> Driven:
+def _through_nodes(victim: RecordedVictim, folder: Path, show: Show) -> Driven:
+    room, calibration = _room(), shipped("calibration/twin")
+    overrides = [
+        f"params.calibration={calibration}",
+        f"params.policy={victim.policy}",
+        f"params.attack={victim.attack}",
+        f"params.vicon_port={_VICON_PORT}",
+    ]
+    run_dir, drive_dir = folder / "nodes", folder / "drive"
+    plan = TrialPlan(room.start_pose, _HORIZON.ticks * _HORIZON.dt_s + 0.2, _NODES)
+    launch = shipped("launch/green_screen.launch.yaml")
+    # Another experiment may be measuring.
+    with hold(LIVE_LOCK), TrialNodes(launch, run_dir, _READY_S) as nodes, _shown(run_dir, show):
+        outcome = nodes.drive(overrides, plan, drive_dir)
+    states = trajectory(drive_dir / "bag", outcome.start_real_ns, _HORIZON)
+    stopped_s = (outcome.end_real_ns - outcome.start_real_ns) / NS_PER_S if outcome.stopped_early else None
+    metrics, held = score(states, room.reference_path, _HORIZON, stopped_s)
+    pictures = frames(drive_dir / "bag", outcome.start_real_ns, len(held))
+    return Driven(held, pictures, metrics, "Through live nodes on the twin")
+
+
+@contextmanager
+def _shown(run_dir: Path, show: Show) -> Iterator[None]:
+    """Show what the policy of live nodes sees, until the context ends."""
+    ended = threading.Event()
+
+    def watch() -> None:
+        with Bus(run_dir) as bus:
+            bus.subscribe(_SEEN)
+            while not ended.is_set():
+                bus.wait(0.1)
+                for received in bus.receive():
+                    with contextlib.suppress(MessageError):
+                        show(rgb_image(received.message(), _SEEN))
+
+    watching = threading.Thread(target=watch, daemon=True)
+    watching.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watching.join()
+
+
+def _in_the_lab(victim: RecordedVictim, show: Show) -> Driven:
     from hardware.worlds.lab.lab import Lab
     from nodes.compositor import show as prepared
 
@@ -103,8 +173,8 @@ def _drive(victim: RecordedVictim, show: Show) -> Driven:
             pictures.append(picture)
             steering_rad = driver.steer(driver.view.image(picture), ())
             state = lab.step(steering_rad, _SPEED_MPS, _HORIZON.dt_s)
-    driven = np.array(states)
-    return Driven(driven, np.stack(pictures), drive_metrics(room.reference_path, driven, _HORIZON))
+    metrics, held = score(np.array(states), room.reference_path, _HORIZON, None)
+    return Driven(held, np.stack(pictures), metrics, "In the simulated lab")
 
 
 def _film(victim: RecordedVictim, driven: Driven, folder: Path) -> Path:

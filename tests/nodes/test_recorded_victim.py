@@ -1,7 +1,8 @@
-"""The recorded victim: it comes with the code, it is labelled, and it is driven in the simulated lab."""
+"""The recorded victim: it comes with the code, it is labelled, and it is driven in the lab where live nodes do not get the time."""
 
 import json
 
+import numpy as np
 import pytest
 
 from advnerf_core.attack.artifact import load_attack
@@ -17,6 +18,7 @@ from nodes.lab.recorded_victim import (
     find_recorded,
     recorded_state,
 )
+from nodes.lab.trials.trial import SpoiledError
 
 
 def test_a_policy_and_the_texture_that_was_found_for_it_come_with_the_code():
@@ -38,23 +40,19 @@ def test_an_installation_without_one_says_so_in_a_line(tmp_path, monkeypatch):
     assert recorded_state(tmp_path) is None
 
 
-def test_the_drive_is_shown_as_it_comes_filmed_and_labelled(tmp_path, monkeypatch):
+def test_a_drive_that_does_not_count_live_is_driven_in_the_lab_and_labelled(tmp_path, monkeypatch):
     monkeypatch.setattr(recorded_drive, "_HORIZON", Horizon(6))
-    folder, said, seen, driven = tmp_path / FOLDER, [], [], recorded_drive._drive
+    folder, said = tmp_path / FOLDER, []
 
-    def watched(victim, show):
-        def shown(rgb):
-            show(rgb)
-            seen.append(recorded_state(tmp_path))
+    def spoiled(victim, into, show):
+        show(np.zeros((188, 336, 3), np.uint8))
+        first = recorded_state(tmp_path)
+        assert (first["label"], first["file"], first["film"]) == (LABEL, f"{FOLDER}/{NOW}", False)
+        raise SpoiledError("late")
 
-        return driven(victim, shown)
-
-    monkeypatch.setattr(recorded_drive, "_drive", watched)
+    monkeypatch.setattr(recorded_drive, "_through_nodes", spoiled)
     folder.mkdir()
     film = recorded_drive.drive_recorded(find_recorded(), folder, said.append)
-    assert len(seen) == 7
-    for now in seen:
-        assert (now["label"], now["file"], now["film"]) == (LABEL, f"{FOLDER}/{NOW}", False)
     assert film.stat().st_size > 1000
     assert all(text.startswith(LABEL) for text in said)
     assert str(film) in said[-1]
