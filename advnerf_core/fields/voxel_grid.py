@@ -293,10 +293,10 @@ def with_border(panel: VoxelGridObject, colours: ArrayLike) -> VoxelGridObject:
     slots = np.pad(
         panel.slots, ((0, 0), (across, across), (across, across)), constant_values=panel.free_count
     )
-    # From rows and columns of a picture to voxels along y and z.
-    seen = np.zeros(around.shape, dtype=np.int32)
-    seen[around] = panel.slot_count + np.arange(around.sum())
-    slots[:, around.T[:, ::-1]] = seen.T[:, ::-1][around.T[:, ::-1]]
+    rows = np.full(around.shape, -1)
+    rows[around] = panel.slot_count + np.arange(around.sum())
+    voxels = rows.T[:, ::-1]  # of a picture's rows and columns those along y and z
+    slots[:, voxels >= 0] = voxels[voxels >= 0]
     wider = across * (panel.box_max[1] - panel.box_min[1]) / len(panel.slots[0])
     grown = np.array([0.0, wider, wider])
     return replace(
