@@ -20,7 +20,6 @@ from advnerf_core.report.evidence.registration import (
     WITHDRAWN,
     SetError,
     read_registration,
-    read_withdrawn,
     withdraw,
 )
 from advnerf_core.report.evidence.results import Evidence, primary_tests, read_evidence, rows
@@ -28,7 +27,6 @@ from advnerf_core.report.evidence.verify import verify_beside, verify_set
 from advnerf_core.report.evidence.verifying.drives import drive_problems
 from advnerf_core.report.evidence.verifying.layout import BESIDE, DIGESTS, PAGE, SET, sets_in
 from advnerf_core.report.evidence.verifying.pictures import picture_problems
-from advnerf_core.report.evidence.verifying.registered import cell_problems
 from advnerf_core.report.evidence.verifying.victims import DECLARED, declare
 from benchmarks.planting.simulated import write_simulated_set
 from benchmarks.planting.world import World, poses_of
@@ -105,61 +103,6 @@ def test_a_file_is_of_the_cell_that_it_is_named_after(copied):
         assert any(
             text.startswith(f"{file}: expected the cell of this name, got {other.stem}") for text in problems
         )
-
-
-def test_a_registered_cell_has_the_registered_settings(original):
-    evidence = evidence_of(original)
-    settings = {"attack": {"starts": 3, "objective": "cte"}, "dt_s": 0.1}
-    scenarios = {
-        name: each.model_copy(update={"settings": settings})
-        for name, each in evidence.registration.scenarios.items()
-    }
-    registration = evidence.registration.model_copy(update={"scenarios": scenarios})
-
-    def problems(theirs):
-        changes = {"registration": registration.digest, "settings": theirs}
-        cells = [cell.model_copy(update=changes) for cell in evidence.all_cells]
-        return list(cell_problems(Evidence(registration, cells), read_withdrawn(original)))
-
-    # A cell has further settings, and a later version has further keys.
-    assert problems({**settings, "seed": 0, "attack": {**settings["attack"], "later": 1}}) == []
-    for theirs, says in (
-        ({**settings, "dt_s": 0.2}, "expected the registered settings, got dt_s 0.2 instead of 0.1"),
-        ({"attack": {"starts": 5}}, "expected the registered settings, got attack.starts 5 instead of 3"),
-        ({}, "expected its settings, as the registration has them, got none"),
-    ):
-        found = problems(theirs)
-        assert len(found) == len(evidence.all_cells)
-        assert found[0].endswith(says)
-
-
-def test_a_victim_with_a_recipe_of_its_own_has_the_settings_of_that(original):
-    evidence = evidence_of(original)
-    shared = {"policy": {"stiffness_1pm": 0.75, "seed": 0}, "architecture": {"hidden": [100, 50, 10]}}
-    own = {"stiffness_1pm": 1.6, "seed": 0, "architecture": "resnet"}
-    scenarios = {
-        name: each.model_copy(update={"settings": {**shared, "recipes": {"hardened": own}}})
-        for name, each in evidence.registration.scenarios.items()
-    }
-    registration = evidence.registration.model_copy(update={"scenarios": scenarios})
-    theirs = {"policy": {"stiffness_1pm": 1.6, "seed": 0}, "architecture": {"architecture": "resnet"}}
-
-    def problems(of_hardened):
-        cells = [
-            cell.model_copy(
-                update={
-                    "registration": registration.digest,
-                    "settings": of_hardened if cell.victim == "hardened" else shared,
-                }
-            )
-            for cell in evidence.all_cells
-        ]
-        return list(cell_problems(Evidence(registration, cells), read_withdrawn(original)))
-
-    assert problems(theirs) == []
-    assert (
-        "got policy.stiffness_1pm 0.75 instead of 1.6" in problems({**theirs, "policy": shared["policy"]})[0]
-    )
 
 
 def no_poses(data):
