@@ -28,6 +28,7 @@ _MOST_UNEVEN = 0.5
 _MOST_HIDDEN, _FAR = 0.5, 64.0
 # Of a photograph: its own blur, of pixels and the interpolation between them, and a larger one that makes it the same for all.
 _OWN_BLUR_PX, _BLUR_PX = 0.6, 1.5
+_BOTH_BLURS_PX = float(np.hypot(_OWN_BLUR_PX, _BLUR_PX))
 _CELLS, _FINER = 96, 4  # of the found print along a side, and samples along a side of a cell
 _LONGEST_ROW = 2**14  # of OpenCV's remap
 
@@ -100,7 +101,7 @@ def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: M
         pixel = _pixel(lens, T_camera_from_face, points)
         white = np.pad(marker_cells(number) / 255.0, _PAPER_CELLS, constant_values=1.0)
         drawn = white.repeat(_FINER, 0).repeat(_FINER, 1)
-        shares.append(_blurred(drawn, np.hypot(_OWN_BLUR_PX, _BLUR_PX) * pixel).ravel())
+        shares.append(_blurred(drawn, _BOTH_BLURS_PX * pixel).ravel())
         linear_seen = linear(sampled(rgb, lens, T_camera_from_face, points))
         seen.append(_blurred(linear_seen, _BLUR_PX * pixel).reshape(-1, 3))
         places.append(points.reshape(-1, 3))
@@ -255,7 +256,7 @@ def print_colours(
         )
     pixel = _pixel(lens, T_camera_from_face, points)
     resolved = encoded(_blurred(linear(raw), _BLUR_PX * pixel))
-    expected = encoded(_blurred(linear(printed), np.hypot(_OWN_BLUR_PX, _BLUR_PX) * pixel))
+    expected = encoded(_blurred(linear(printed), _BOTH_BLURS_PX * pixel))
     inside = (np.abs(points[..., 1:]) < 0.5 * np.array(sheet.size_m)).all(axis=-1)
     inside &= np.isfinite(resolved).all(axis=-1)
     off = (_in_white(resolved, light, points, light.black) - expected)[inside]
