@@ -43,7 +43,7 @@ from nodes.audit.schedule import NEVER_TRIED
 from nodes.audit.searching import FoundAttack, Searches
 from nodes.audit.spots import Spot
 from nodes.audit.verdict import effect_in_words
-from nodes.experiment.plan.object_kinds import footprint_m, name_of
+from nodes.experiment.plan.object_kinds import extent_m, name_of
 from nodes.experiment.show.context import Experiment
 from nodes.runtime.progress import Report
 
@@ -205,12 +205,12 @@ def _strongest(known: Known, folder: Path) -> JudgedObject | None:
     placed, texture = known.spots[known.best.spot].placed, texture_of(known.best.attack)
     if texture is not None:
         write_image(folder / TEXTURE, texture)
-    length, width = (placed.scale * each for each in footprint_m(placed.kind))
+    length, width, height = (placed.scale * each for each in extent_m(placed.kind))
     return JudgedObject(
         object=AuditedObject(
             name=placed.name,
             kind=name_of(placed.kind),
-            size_m=(length, width, width),
+            size_m=(length, width, height),
             pose=PlacedPose(x_m=placed.x_m, y_m=placed.y_m, z_m=placed.z_m, yaw_rad=placed.yaw_rad),
             texture=None if texture is None else TEXTURE,
             texture_sha256=None if texture is None else sha256_of(folder / TEXTURE),

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from advnerf_core.objects.voxel.mesh import SurfaceMesh
 
 PANEL, CUBE, BALL = "panel", "cube", "ball"
-# Length and width [m] at scale 1: of the objects that ``advnerf scene object build --generate`` makes, of a square panel that stands upright, and of
-# what only a learned scene of a user's own takes: a cube with one textured face, and a ball.
-MADE_HERE_M: dict[str, tuple[float, float]] = {
-    "small_car": (3.64, 1.7),
-    "hydrant": (0.48, 0.48),
-    PANEL: (0.1, 2.0),
-    CUBE: (2.0, 2.0),
-    BALL: (0.7, 0.7),
+# Length, width and height [m] at scale 1: of the objects that ``advnerf scene object build --generate`` makes, of a square panel that stands upright,
+# and of what only a learned scene of a user's own takes: a cube with one textured face, and a ball.
+MADE_HERE_M: dict[str, tuple[float, float, float]] = {
+    "small_car": (3.64, 1.7, 1.46),
+    "hydrant": (0.48, 0.48, 0.75),
+    PANEL: (0.1, 2.0, 2.0),
+    CUBE: (2.0, 2.0, 2.0),
+    BALL: (0.7, 0.7, 0.7),
 }
 # What ``advnerf scene object build`` writes; meshes whose format specifies the unit; and meshes whose unit must be given.
 OBJECT_SUFFIX, MESH_SUFFIXES, UNITLESS_SUFFIXES = (
@@ -78,18 +78,23 @@ def files_of(kinds: list[str]) -> dict[str, str]:
 
 
 def footprint_m(kind: str) -> tuple[float, float]:
-    """Length and width [m] of the ground that an object of a kind covers at scale 1.
+    """Length and width [m] of the ground that an object of a kind covers at scale 1; raises as `extent_m`."""
+    return extent_m(kind)[:2]
+
+
+def extent_m(kind: str) -> tuple[float, float, float]:
+    """Length, width and height [m] of an object of a kind at scale 1, about the axis that it turns around.
 
     Raises:
         MeshError, ObjectFileError: The file cannot be read.
     """
     if kind in MADE_HERE_M:
         return MADE_HERE_M[kind]
-    return _footprint_m(kind, Path(kind).stat().st_mtime_ns)
+    return _extent_m(kind, Path(kind).stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=16)
-def _footprint_m(kind: str, changed_ns: int) -> tuple[float, float]:
+def _extent_m(kind: str, changed_ns: int) -> tuple[float, float, float]:
     del changed_ns  # part of the cache's key
     if is_mesh(kind):
         low, high = load_mesh_of(kind).box
@@ -99,7 +104,7 @@ def _footprint_m(kind: str, changed_ns: int) -> tuple[float, float]:
         low, high = load_object(Path(kind)).solid_box
     # It turns about its axis, which need not be in its middle.
     length, width = 2.0 * np.maximum(np.abs(low), np.abs(high))[:2]
-    return float(length), float(width)
+    return float(length), float(width), float(high[2] - low[2])
 
 
 def load_mesh_of(kind: str) -> SurfaceMesh:
