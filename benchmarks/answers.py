@@ -162,13 +162,17 @@ def _transfers(sets: Sequence[Mapping[str, Any]], about: Mapping[str, SetAbout])
 def _claimed(sets: Sequence[Mapping[str, Any]]) -> str:
     """What claims over places and victims say, also where the attack does nothing."""
     said = [
-        f"{found['name']} {claim['difference_m']:+.3f} m (95 % {ends(claim['low_m'], claim['high_m'])}), {claim['off_track_points']:+.0f} points of drives "
-        f"off the track ({sample_of(claim)})"
+        f"{found['name']} {claim['difference_m']:+.3f} m (95 % {ends(claim['low_m'], claim['high_m'])}), {claim['off_track_points']:+.0f} "
+        f"points ({sample_of(claim)})"
         for found in sets
         for claim in found.get("claims", ())
         if claim["difference_m"] is not None
     ]
-    return f" It adds to the strongest baseline, per tick: {'; '.join(said)}." if said else ""
+    return (
+        f" It adds to the strongest baseline, per tick and in drives off the track: {'; '.join(said)}."
+        if said
+        else ""
+    )
 
 
 def _counts(sets: Sequence[Mapping[str, Any]], about: Mapping[str, SetAbout]) -> str:
@@ -214,7 +218,7 @@ def _victims(sets: Sequence[Mapping[str, Any]], published: Path) -> str:
     place = next(name for name, each in named if each is off)
     whom = "them" if len(titles) == 1 else "those trained with textures"
     return (
-        f"Victims, as their sets name them: {', '.join(titles)}. The best random search of each set moves {whom} {min(each.deployed.best_m for each in found):.3f} to "
+        f"{len(titles)} victim{'s' * (len(titles) > 1)}, as their sets name them. The best random search of each set moves {whom} {min(each.deployed.best_m for each in found):.3f} to "
         f"{worst.deployed.best_m:.3f} m per tick where it is deployed (set {place}: {off.deployed.off_track} of {off.deployed.drives} drives off the track, "
         f"{off.deployed.all_off_track} of {off.deployed.all_drives} of all {off.searches} searches), and up to "
         f"{max(each.surrogate.best_m for each in found):.3f} m in the learned scene."

@@ -20,7 +20,11 @@ from benchmarks.results import REPOSITORY, LedgerRow
 COMMAND = "python -m benchmarks.paper_table"
 PUBLISHED = REPOSITORY / "docs" / "results"
 # The sets of each experiment, with what later ones changed.
-_CARS = {"paper_car": "", "paper_monitor": ", behind the way of a car that leaves the track"}
+_CARS = {
+    "paper_car": "",
+    "paper_car_sides": ", one side of the path maximised",
+    "paper_monitor": ", behind the way of a car that leaves the track",
+}
 _JUNCTIONS = {"paper_junction": "", "paper_junction_sides": ", one side of the path maximised"}
 # The set that attacks something else than colours of voxels, on the straight drive, and what each of its scenarios attacks.
 _SPACES = "paper_spaces"

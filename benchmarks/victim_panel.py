@@ -20,6 +20,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
 from advnerf_core.report.evidence.families import GRADIENT
+from advnerf_core.report.evidence.verifying.layout import SET
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes, write_png
 from benchmarks.results import REPOSITORY, LedgerRow
@@ -31,6 +32,7 @@ from nodes.experiment.steps.deploy import drive_through_world
 from nodes.experiment.steps.run import prepare_victims
 
 KEPT = REPOSITORY / "docs" / "results" / "victim_panel_drives.json"
+_SET = REPOSITORY / "docs" / "results" / "victim_panel" / SET
 _PICTURE = REPOSITORY / "docs" / "victim_panel.png"
 COMMAND = "python -m benchmarks.victim_panel"
 
@@ -104,9 +106,21 @@ def rows_of(found: Mapping[str, Any]) -> list[LedgerRow]:
     ]
 
 
+def claim_rows(claim: Mapping[str, Any]) -> list[LedgerRow]:
+    """What the registered claim says: how many more drives leave the track, and how much more they err, than past the strongest baseline."""
+    points = ", ".join(f"{each['victim']} {each['off_track_points']:+.0f}" for each in claim["each"])
+    metres = ", ".join(f"{each['victim']} {each['difference_m']:+.3f}" for each in claim["each"])
+    than = "the gradient's green screen than past the strongest baseline's"
+    return [
+        LedgerRow(f"panel of victims: more drives off the track past {than}", round(claim["off_track_points"]), "points", "", None, COMMAND, points),
+        LedgerRow(f"panel of victims: more |CTE| past {than}, lower 95 % bound for new victims", round(claim["low_m"], 3), "m per tick", "", None, COMMAND, f"{claim['difference_m']:+.3f} m in the mean, to {claim['high_m']:+.3f}; {metres}"),
+    ]  # fmt: skip
+
+
 def ledger_rows() -> list[LedgerRow]:
-    """The rows of the kept drives."""
-    return rows_of(read_json(KEPT))
+    """The rows of the published claim, and of the kept drives."""
+    (claim,) = read_json(_SET)["claims"]
+    return [*claim_rows(claim), *rows_of(read_json(KEPT))]
 
 
 def picture(victims: Sequence[str], excess: Array, off: Array) -> Figure:

@@ -43,7 +43,7 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     # The maximum over searches, from the kept drives: an attacker takes it.
     victims = found["Against which victims?"]
     assert victims.startswith(
-        "Victims, as their sets name them: trained with textures. The best random search of each set moves them 0.169 to 0.169 m"
+        "1 victim, as their sets name them. The best random search of each set moves them 0.169 to 0.169 m"
     )
     assert "(set room: 5 of 5 drives off the track, 20 of 30 of all 6 searches), and up to 0.185 m" in victims
     (line,) = sets_table(tmp_path).splitlines()[2:]
@@ -58,8 +58,8 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     assert everywhere.count("[paper_car]") == 2
     # A claim about places is told too, with the places where nothing was found.
     (transfers,) = [each.text for each in answers([], published) if each.question == "Does it transfer?"]
-    assert "to the strongest baseline, per tick: metadrive_billboard +0.487 m (95 % " in transfers
-    assert "+22 points of drives off the track (4 places and 2 victims); " in transfers
+    assert "to the strongest baseline, per tick and in drives off the track: metadrive_billboard +0.487 m (95 % " in transfers
+    assert "+22 points (4 places and 2 victims); " in transfers
     # Nothing is claimed that was not measured.
     assert "How fast?" not in found
     assert answers([], tmp_path / "none") == []
@@ -105,5 +105,5 @@ def test_a_set_with_a_claim_and_no_test_is_told(tmp_path):
     shutil.copy(published / "sets_about.json", tmp_path / "sets_about.json")
     (answer,) = [each.text for each in answers([], tmp_path) if each.question == "Does it transfer?"]
     assert answer.startswith(
-        "1 registered sets are 1 groups of searches in 1 worlds: 1 sets explore, 0 confirm. It adds to the strongest baseline, per tick: "
+        "1 registered sets are 1 groups of searches in 1 worlds: 1 sets explore, 0 confirm. It adds to the strongest baseline, per tick and in drives off the track: "
     )

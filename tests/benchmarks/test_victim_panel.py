@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.victim_panel import excess_m, off_track, picture, rows_of, share_kept
+from benchmarks.victim_panel import claim_rows, excess_m, off_track, picture, rows_of, share_kept
 
 
 def drives(totals, off):
@@ -29,3 +29,16 @@ def test_rows_are_attacked_and_columns_driven_victims():
     assert "50 % of its drives off the track; past the attacks on others 0.300 to 0.300 m" in stiff.note
     texts = {text.get_text() for text in picture(FOUND["victims"], excess, off_track(FOUND)).axes[0].texts}
     assert texts == {"1.00\n100 %", "0.30\n0 %", "0.20\n0 %", "0.50\n50 %"}
+
+
+def test_rows_of_the_claim_are_its_numbers():
+    each = [
+        {"victim": "soft", "difference_m": 0.25, "off_track_points": 100.0},
+        {"victim": "stiff", "difference_m": -0.05, "off_track_points": 0.0},
+    ]
+    points, metres = claim_rows(
+        {"each": each, "off_track_points": 50.0, "difference_m": 0.1, "low_m": -0.02, "high_m": 0.22}
+    )
+    assert (points.value, points.note) == (50, "soft +100, stiff +0")
+    assert (metres.value, metres.unit) == (-0.02, "m per tick")
+    assert metres.note == "+0.100 m in the mean, to +0.220; soft +0.250, stiff -0.050"
