@@ -63,6 +63,12 @@ class Definition:
         self._types = types
 
     @property
+    def begins_with_header(self) -> bool:
+        """Whether the first field is a header."""
+        fields = self._fields(self.typename)
+        return bool(fields) and _type_in(fields[0][1]) == "std_msgs/msg/Header"
+
+    @property
     def is_ours(self) -> bool:
         """Whether advnerf's type with that name has exactly the same fields."""
         return self._same(self.typename, set())

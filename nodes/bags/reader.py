@@ -48,6 +48,16 @@ def read_info(bag: Path) -> BagInfo:
     )
 
 
+def recorded_topics(bag: Path) -> dict[str, RecordedTopic]:
+    """How the messages of each topic are stored, by its name."""
+    return {topic.topic: topic for part in _parts(bag) for topic in part.recorded.values()}
+
+
+def has_publish_times(bag: Path) -> bool:
+    """Whether messages have publish times; other formats than MCAP store none, and log times stand for them."""
+    return all(part.format is BagFormat.MCAP for part in _parts(bag))
+
+
 def message_spans(bag: Path) -> list[tuple[int, int]]:
     """Spans of log time that cover all messages, from the index of the bag [ns since 1970]."""
     spans: list[tuple[int, int]] = []

@@ -9,23 +9,24 @@ from pathlib import Path
 
 import numpy as np
 
-from nodes.bags.reader import read_info, read_messages
+from nodes.bags.message_definitions import Definition, parse_definition
+from nodes.bags.reader import has_publish_times, read_messages, recorded_topics
+from nodes.bags.stored_types import ROS1, RecordedTopic
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.messages import fields_of
-from nodes.runtime.topics import type_of_topic
+from nodes.runtime.errors import MessageError
 
-# In CDR, a message with a header begins with four bytes of encapsulation, followed by the stamp.
+# Of a message that begins with a header, four bytes precede the stamp: the encapsulation of CDR, or the sequence number of ROS 1.
 _STAMP = struct.Struct("<iI"), struct.Struct(">iI")
 _STAMP_AT, _NS_PER_MS = 4, 1e6
 
 
 @dataclass(frozen=True)
 class Delays:
-    """Delays of one topic [ms]; None if the messages have no stamp, or a stamp of zero.
+    """Delays of one topic [ms]. Those of stamps are None if the messages have none, or zeros; those of publication if the bag has none.
 
     Attributes:
-        publish_ms: Median from capture to publication.
-        publish_worst_ms: Longest delay from capture to publication.
+        publish_ms: Median from capture to publication; to reception if the bag has no publish times.
+        publish_worst_ms: Longest such delay.
         receive_ms: Median from publication to reception by the recorder.
         receive_worst_ms: Longest delay from publication to reception.
         backwards: Number of messages whose stamp is older than the previous message's.
@@ -34,45 +35,57 @@ class Delays:
 
     publish_ms: float | None
     publish_worst_ms: float | None
-    receive_ms: float
-    receive_worst_ms: float
-    backwards: int
-    future: int
+    receive_ms: float | None
+    receive_worst_ms: float | None
+    backwards: int | None
+    future: int | None
 
 
 def read_delays(bag: Path) -> dict[str, Delays]:
     """Read the delays of every topic with messages, by name. The whole bag is read."""
-    names = {topic.name: _begins_with_stamp(topic.name, topic.type) for topic in read_info(bag).topics}
+    stored = {name: topic for name, topic in recorded_topics(bag).items() if _begins_with_stamp(topic)}
     rows: dict[str, list[tuple[int, int, int]]] = {}
     for message in read_messages(bag, as_recorded=True):
-        stamp_ns = _stamp_ns(message.cdr) if names[message.topic] else 0
+        recorded = stored.get(message.topic)
+        stamp_ns = 0 if recorded is None else _stamp_ns(message.cdr, recorded.serialization)
         rows.setdefault(message.topic, []).append((stamp_ns, message.publish_ns, message.log_ns))
-    return {topic: _delays(found) for topic, found in rows.items()}
+    published = has_publish_times(bag)
+    return {topic: _delays(found, published) for topic, found in rows.items()}
 
 
-def _delays(times_ns: list[tuple[int, int, int]]) -> Delays:
+def _delays(times_ns: list[tuple[int, int, int]], published: bool) -> Delays:
     """Compute delays from stamp, publish and log time of each message [ns]. Integers, because a damaged bag may have any value."""
-    received = [(log - publish) / _NS_PER_MS for _, publish, log in times_ns]
     stamped = [row for row in times_ns if row[0] > 0]
-    published = [(publish - stamp) / _NS_PER_MS for stamp, publish, _ in stamped]
     return Delays(
-        float(np.median(published)) if published else None,
-        max(published, default=None),
-        float(np.median(received)),
-        max(received),
-        sum(after[0] < before[0] for before, after in pairwise(stamped)),
-        sum(stamp > log for stamp, _, log in stamped),
+        *_median_and_worst([publish - stamp for stamp, publish, _ in stamped]),
+        *_median_and_worst([log - publish for _, publish, log in times_ns if published]),
+        sum(after[0] < before[0] for before, after in pairwise(stamped)) if stamped else None,
+        sum(stamp > log for stamp, _, log in stamped) if stamped else None,
     )
 
 
-def _begins_with_stamp(topic: str, typename: str) -> bool:
-    """Whether a topic is in the topic table and its type begins with a header."""
-    fields = fields_of(typename) or []
-    return type_of_topic(topic) == typename and fields[0][0] == "header"
+def _median_and_worst(delays_ns: list[int]) -> tuple[float | None, float | None]:
+    delays_ms = [delay / _NS_PER_MS for delay in delays_ns]
+    return (float(np.median(delays_ms)), max(delays_ms)) if delays_ms else (None, None)
 
 
-def _stamp_ns(cdr: bytes) -> int:
-    if len(cdr) < _STAMP_AT + 8:
+def _begins_with_stamp(recorded: RecordedTopic) -> bool:
+    """Whether the messages of a topic begin with a header, as the bag defines their type, or as advnerf does."""
+    text = recorded.definition
+    try:
+        definition = (
+            parse_definition(recorded.type, text, recorded.definition_language)
+            if text
+            else Definition(recorded.type, {})
+        )
+        return definition.begins_with_header
+    except MessageError:
+        return False
+
+
+def _stamp_ns(data: bytes, serialization: str) -> int:
+    if len(data) < _STAMP_AT + 8:
         return 0
-    seconds, nanoseconds = _STAMP[0 if cdr[1] & 1 else 1].unpack_from(cdr, _STAMP_AT)
+    little = serialization == ROS1 or data[1] & 1
+    seconds, nanoseconds = _STAMP[0 if little else 1].unpack_from(data, _STAMP_AT)
     return int(seconds) * NS_PER_S + int(nanoseconds)

@@ -95,11 +95,13 @@ def _print_delays(bag: Path) -> None:
         "in future",
     )
     for topic, delays in sorted(read_delays(bag).items()):
-        published, worst = (
-            "-" if value is None else f"{value:.1f}" for value in (delays.publish_ms, delays.publish_worst_ms)
+        times = delays.publish_ms, delays.publish_worst_ms, delays.receive_ms, delays.receive_worst_ms
+        counts = delays.backwards, delays.future
+        rows.add_row(
+            topic,
+            *("-" if value is None else f"{value:.1f}" for value in times),
+            *("-" if count is None else str(count) for count in counts),
         )
-        received = f"{delays.receive_ms:.1f}", f"{delays.receive_worst_ms:.1f}"
-        rows.add_row(topic, published, worst, *received, str(delays.backwards), str(delays.future))
     print_table(rows)
 
 

@@ -182,6 +182,7 @@ def test_delays_are_those_that_were_written(tmp_path):
     assert (car.receive_ms, car.receive_worst_ms) == (3.0, 15.0)  # of 1, 5, 15 and 1
     assert (car.backwards, car.future) == (1, 1)
     assert (delays["/clock"].publish_ms, delays["/clock"].receive_ms) == (None, 3.0)
+    assert (delays["/clock"].backwards, delays["/clock"].future) == (None, None)
 
 
 def test_the_commands_say_what_was_lost_how_late_it_came_and_what_rides_along(tmp_path, capsys):

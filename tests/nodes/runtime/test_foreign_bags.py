@@ -77,11 +77,30 @@ def test_a_foreign_bag_opens_with_its_topics_types_counts_and_times(tmp_path, wr
     assert [m.log_ns for m in messages] == sorted(m.log_ns for m in messages)
     assert read_attachments(bag) == {}
     assert read_info(bag.parent if bag.is_file() else bag).messages == 3 * COUNT
-    assert set(read_delays(bag)) == {"/camera/image_raw", "/chatter", "/vicon/car"}
+    delays = read_delays(bag)
+    assert set(delays) == {"/camera/image_raw", "/chatter", "/vicon/car"}
+    for topic in (
+        "/camera/image_raw",
+        "/vicon/car",
+    ):  # stamps are 5 ms before `drive` begins to write a round
+        assert delays[topic].publish_worst_ms == pytest.approx(5.0, abs=2.5)
+        assert (delays[topic].backwards, delays[topic].future) == (0, 0)
+    assert (delays["/chatter"].publish_ms, delays["/chatter"].future) == (None, None)
+    assert (delays["/chatter"].receive_ms is None) == (
+        bag.suffix in {".db3", ".bag"} or any(bag.glob("*.db3"))
+    )
     late = list(read_messages(bag, ["/vicon/car"], start_offset_s=0.25))
     assert [m.log_ns for m in late] == [START_NS + k * STEP_NS for k in range(3, COUNT)]
     with pytest.raises(BagError, match="has no topic /odom; it has /camera/image_raw, /chatter, /vicon/car"):
         list(read_messages(bag, ["/odom"]))
+
+
+@EVERY_WRITER
+def test_stamps_count_on_topics_of_any_name(tmp_path, writer):
+    bag = WRITERS[writer](tmp_path / "drive", image_topic="/front/image")
+    found = read_delays(bag)["/front/image"]
+    assert found.publish_worst_ms == pytest.approx(5.0, abs=2.5)
+    assert (found.backwards, found.future) == (0, 0)
 
 
 @EVERY_WRITER
