@@ -6,18 +6,20 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from advnerf_core.data.logs.choice import LogError
 from advnerf_core.documents import read_json
 from advnerf_core.driving.expert import Expert
 from advnerf_core.files import write_atomically, write_json
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
-from advnerf_core.learning.frames import FrameSet, FrameStore
+from advnerf_core.learning.frames import Frames, FrameSet, FrameStore
 from advnerf_core.learning.imitation import ImitationProgress, train_policy
 from advnerf_core.learning.recipe import ImitationConfig, SourcePlan
 from advnerf_core.places import require_utf8
@@ -29,6 +31,7 @@ from nodes.runtime.progress import Report
 
 POLICY = "policy.safetensors"
 _FRAMES = "frames"
+_MOST_SHARED = 0.1  # of the images of a log; two drives of a simulator may start with the same ones
 _IS_DIGEST = re.compile("[0-9a-f]{16}")
 
 
@@ -64,6 +67,9 @@ def train_from_recordings(
 
     Frames and checkpoints are in ``out/work/<digest of all inputs>``. The same call resumes, or returns at once if finished. Other
     recordings or settings start a new training, and remove the earlier work when they are finished.
+
+    Raises:
+        LogError: Two logs have the same images.
     """
     require_utf8(out.absolute())
     digests = {log.name: _digest_of(log) for log in logs}
@@ -80,6 +86,7 @@ def train_from_recordings(
     report: Report = progress or (lambda share, text="": None)
     store = FrameStore(work / _FRAMES)
     left_out = {log.name: _cut(log, digests[log.name], view, expert, store, work, report) for log in logs}
+    _refuse_shared_images({name: store.load(_shard(digest)) for name, digest in digests.items()})
     if surrogate is None:
         sha256, mae = _clone(store, view, expert, config, work, {"recordings": digests}, report)
     else:
@@ -117,6 +124,21 @@ def _cut(
         write_atomically(record, json.dumps(recording.counts) + "\n")
         store.append(shard, recording.frames)
     return {reason: int(count) for reason, count in read_json(record).items()}
+
+
+def _refuse_shared_images(shards: Mapping[str, Frames]) -> None:
+    """Refuse one drive in two logs, in whatever formats: what is held out of one would be learned from the other."""
+    images = {
+        name: {hashlib.sha256(image.tobytes()).digest() for image in shard.images}
+        for name, shard in (shards.items() if len(shards) > 1 else ())
+    }
+    for one, other in combinations(images, 2):
+        shared = len(images[one] & images[other])
+        if shared > _MOST_SHARED * min(len(images[one]), len(images[other])):
+            raise LogError(
+                f"expected every drive once, as its frames are learned from or held out, got {one} and {other}, which have {shared} images "
+                "in common; remove one of them"
+            )
 
 
 def _clone(

@@ -248,3 +248,10 @@ def test_a_damaged_bag_is_one_line(tmp_path, monkeypatch, capsys):
         assert advnerf(monkeypatch, "policy", "log", "info", str(bag)) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert file.name in line
+
+
+def test_one_drive_in_two_formats_is_not_trained_on(tmp_path, monkeypatch, capsys):
+    logs = [str(write_ackermann(tmp_path / form, form, count=20)) for form in ("ros1", "ros2")]
+    assert advnerf(monkeypatch, "policy", "train", *logs, "--steps", "1", "-o", str(tmp_path / "out")) == 2
+    said = f"got {logs[0]} and {logs[1]}, which have 20 images in common; remove one of them"
+    assert said in capsys.readouterr().err

@@ -400,6 +400,8 @@ def test_a_bag_says_what_it_lacks(tmp_path):
 def test_the_commands_train_on_several_logs_and_evaluate_held_out_frames(tmp_path, monkeypatch, capsys):
     drive = str(write_udacity(tmp_path / "drive", False, "IMG/"))
     tub = str(write_tub_2(tmp_path / "tub", size=(60, 80)))
+    for k, file in enumerate((tmp_path / "tub/images").iterdir()):  # not the images of the other drive
+        cv2.imwrite(str(file), np.full((60, 80, 3), GREY * k + 9, np.uint8))
     logs = [drive, f"{tub},steering-full-rad=0.4"]
     assert advnerf(monkeypatch, "policy", "train", *logs, "--steps", "2", "-o", str(tmp_path / "policy")) == 0
     shown = capsys.readouterr().out

@@ -1,5 +1,6 @@
 """Foreign logs, error figures against numpy, saliency of a network whose gradient is known, training that resumes."""
 
+import contextlib
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from advnerf_core.data.logs.choice import LogChoice, LogError
 from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole
+from advnerf_core.learning.frames import Frames
 from advnerf_core.learning.recipe import ImitationConfig
 from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.policies.view import PolicyView
@@ -215,6 +217,24 @@ def test_a_map_without_a_gradient_is_refused(steer, got):
         ConfigError, match=f"a gradient of the steering in the images, got {got}.* --saliency 0"
     ):
         saliency(lambda images, goals: steer(images), np.zeros((2, 66, 200, 3), np.uint8))
+
+
+@pytest.mark.parametrize(("common", "refused"), [(40, True), (10, True), (4, False), (0, False)])
+def test_images_that_another_log_has_are_not_held_out(common, refused):
+    """The second log has the last images of the first, in another order."""
+    images = np.random.default_rng(0).integers(0, 256, (100, 66, 200, 3), dtype=np.uint8)
+
+    def frames(rows):
+        count = len(rows)
+        numbers = np.zeros((count, 3)), np.zeros(count, np.float32), np.zeros((count, 0), np.float32)
+        return Frames(images[rows], *numbers, np.zeros(count, bool))
+
+    logs = {"one": frames(np.arange(50)), "two": frames(np.arange(50 - common, 100 - common)[::-1])}
+    said = pytest.raises(
+        LogError, match=f"every drive once.* got one and two, which have {common} images in common"
+    )
+    with said if refused else contextlib.nullcontext():
+        training._refuse_shared_images(logs)
 
 
 def test_training_learns_is_kept_and_begins_anew_for_other_recordings(tmp_path, monkeypatch):
