@@ -56,6 +56,7 @@ def log_export(
         )
     print(
         f"{output}: {done.frames} frames in {done.episodes} episodes at {done.rate_hz} Hz; {done.left_out} images left out"
+        + ("" if found.rate_hz else f"; the log has {found.rate_in_words}")
     )
 
 

@@ -173,6 +173,8 @@ def train(
     print_table(rows)
     print("".join(f"{note}\n" for note in crop_notes(opened, view)), end="")
     for each in opened:
+        if not each.log.rate_hz:
+            print(f"{each.name}: {each.log.rate_in_words}; frames are held out in the order of the log")
         if each.log.joined_by:
             print(f"{each.name}: images and steering are joined by {each.log.joined_by}")
     print(

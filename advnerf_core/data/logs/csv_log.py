@@ -7,7 +7,10 @@ that recorded them. Steering is -1 to 1 for 25 degrees, and positive to the righ
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from itertools import pairwise
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -17,13 +20,15 @@ from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.logs.choice import LogChoice, LogError
 from advnerf_core.data.logs.drive_log import DriveLog, LogFrame, SteeringUnit, refuse_repeated_images
-from advnerf_core.documents import raise_problems
+from advnerf_core.documents import is_real, raise_problems
 from advnerf_core.errors import ConfigError
 
 UDACITY_FILE = "driving_log.csv"
 _UDACITY = ("center", "left", "right", "steering", "throttle", "brake", "speed")
 _CAMERAS = _UDACITY[:3]
 _FULL_RAD = math.radians(25.0)
+# Such as time, time_ms, Time [s], stamp, header.timestamp_ns; but not exposure_time, which is a duration.
+_TIMES = re.compile(r"(time|(.*[^a-z])?(time[_ ]?)?stamp)([_ ]?[mun]?s)?\s*([\[(].*)?", re.IGNORECASE)
 
 
 def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
@@ -35,6 +40,7 @@ def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
 
     Raises:
         ConfigError: A row cannot be read; all problems are one error.
+        LogError: Times go back, or an image is missing or there twice.
     """
     first = read_csv(path, bare=_UDACITY)[:1]
     is_udacity = any(set(_UDACITY[:4]) <= set(row.values) for row in first)
@@ -77,11 +83,41 @@ def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
         tuple(name for name in (rows[0].values if rows else ()) if name not in (*_CAMERAS, images)),
         unit,
         len(rows),
-        math.nan,
+        0.0 if _times_repeat(rows) else math.nan,
         0,
         lambda: np.array(values, np.float64),
         frames,
     )
+
+
+def _times_repeat(rows: Sequence[CsvRow]) -> bool:
+    """Whether a column with times has some twice, as of a slow clock. Their unit is not known, so that they give no rate.
+
+    Raises:
+        LogError: Times go back: blocks of rows that are held out would have neighbours among the others.
+    """
+    repeat = False
+    for name in (each for each in (rows[0].values if rows else ()) if _TIMES.fullmatch(each)):
+        for before, after in pairwise(rows):
+            step = _time(after.values[name]) - _time(before.values[name])
+            if step < 0.0:
+                raise LogError(
+                    f"{after.place}: {name}: expected times that go forward, got {after.values[name]!r:.40} after {before.values[name]!r:.40}; "
+                    "sort the rows, give each drive a file of its own, or rename the column if it has no times"
+                )
+            repeat |= step == 0.0
+    return repeat
+
+
+def _time(text: str) -> float:
+    """A number, or a date and time; NaN for anything else."""
+    text = text.strip()
+    try:
+        return (
+            float(text) if is_real(text) else datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp()
+        )
+    except (ValueError, OverflowError, OSError):
+        return math.nan
 
 
 def _image_file(row: CsvRow, folder: Path, column: str) -> Path:

@@ -448,6 +448,58 @@ def test_what_is_wrong_with_the_times_of_a_log_is_said(tmp_path, monkeypatch, ca
     assert not (tmp_path / "out").exists()
 
 
+def write_timed(folder, column, times):
+    """A CSV file with a column of times."""
+    folder.mkdir()
+    for k in range(len(times)):
+        cv2.imwrite(str(folder / f"{k}.png"), np.full((48, 64, 3), GREY * k, np.uint8))
+    rows = [f"{k}.png,{value(k)},{time}" for k, time in enumerate(times)]
+    (folder / "drive.csv").write_text("\n".join([f"image,steering,{column}", *rows]) + "\n")
+    return folder / "drive.csv"
+
+
+FORWARD = [1700000000 + 0.1 * k for k in range(8)]
+DAYS = [f"2026-11-30T10:00:0{k}Z" for k in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("column", "times", "row"),
+    [
+        ("time", [*FORWARD[:3], *FORWARD[:-3:-1], FORWARD[3]], 6),
+        ("Timestamp [ms]", [3, 2, 1, 0], 3),
+        ("header.stamp_ns", [1, 2, 3, 1e-3], 5),
+        ("stamp", [*DAYS[4:], *DAYS[:4]], 6),
+        ("exposure_time", [3, 2, 1, 0], None),
+        ("timeout", [3, 2, 1, 0], None),
+        ("timestamp", ["b", "a", "c", "a"], None),
+        ("time", FORWARD, None),
+        ("time", DAYS, None),
+    ],
+)
+def test_rows_that_are_not_in_the_order_of_their_times_are_refused(tmp_path, column, times, row):
+    file = write_timed(tmp_path / "log", column, times)
+    if row is None:
+        assert math.isnan(open_log(file).rate_hz)
+        return
+    said = rf"drive\.csv:{row}: {re.escape(column)}: expected times that go forward, got '{times[row - 2]}' after '{times[row - 3]}'; sort"
+    with pytest.raises(LogError, match=said):
+        open_log(file)
+
+
+def test_times_of_a_slow_clock_are_said(tmp_path, monkeypatch, capsys):
+    file = write_timed(tmp_path / "log", "time_s", [1700000000 + k // 3 for k in range(8)])
+    log = f"{file},steering-full-rad=0.4,steering-positive=left"
+    out = ["-o", str(tmp_path / "out")]
+    for command in (["log", "info", log], ["train", log, "--steps", "1", *out]):
+        assert advnerf(monkeypatch, "policy", *command) == 0
+        assert "times that go back or repeat" in " ".join(capsys.readouterr().out.split())
+    pytest.importorskip("pyarrow")
+    pytest.importorskip("av")
+    export = ["log", "export", log, "--rate", "10", "-o", str(tmp_path / "set")]
+    assert advnerf(monkeypatch, "policy", *export) == 0
+    assert "the log has times that go back or repeat" in capsys.readouterr().out
+
+
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared logs are not here")
 def test_the_tub_of_donkeycar_s_tests_is_read_and_a_bag_without_images_refused():
     log = open_log(SHARED / "donkey_tub", LogChoice(steering_full_rad=0.3))
