@@ -7,12 +7,13 @@ radians, left positive, by definition of the message. The velocities of a ``Twis
 from __future__ import annotations
 
 import math
+import sys
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
-from itertools import islice
+from itertools import islice, pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from advnerf_core.geometry import yaw_of
 from nodes.bags.images import CAMERA_TOPICS
 from nodes.bags.info import BagInfo, BagMessage
 from nodes.bags.reader import read_attachments, read_info, read_messages
+from nodes.bags.time_gaps import LONGEST_SILENCE_S, find_gaps
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import MessageError
@@ -49,6 +51,7 @@ _MOST_BACK_S = 1.0  # messages of one topic may overtake each other, but no cloc
 _TIMED = 200  # images from which the rate is determined
 _STAMPS = 8  # messages that show whether a topic is stamped
 _Time = Callable[[BagMessage, Any], int]
+_Span = tuple[int, int]
 
 
 @dataclass
@@ -108,7 +111,8 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
     with _naming(others):
         unstamped = _unstamped(bag, kinds)
     time_ns = _recorded_ns if unstamped else _stamped_ns
-    track = cache(partial(_read_track, bag, steering, joined, time_ns))
+    spans = cache(partial(_spans, info, [*joined, *([steering] if steering else [])] or [images]))
+    track = cache(lambda: _read_track(bag, steering, joined, time_ns, spans()))
     return DriveLog(
         bag,
         _format(info),
@@ -121,7 +125,7 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
         _rate_hz(bag, images),
         counts.get(CAR_TOPIC, 0),
         lambda: np.array([each[1] for each in track().sent], np.float64),
-        lambda: _frames(bag, images, others, track(), time_ns),
+        lambda: _frames(bag, images, others, track(), time_ns, spans()),
         labels="expert" if counts.get(CAR_TOPIC) else "recorded",
         attached=lambda: read_attachments(bag) if info.attachments else {},
         unchecked=info.unchecked,
@@ -201,10 +205,10 @@ def _refuse_going_back(latest_ns: dict[str, int], topic: str, stamp_ns: int, pla
 
 
 def _frames(
-    bag: Path, images: str, others: Sequence[str], track: _Track, time_ns: _Time
+    bag: Path, images: str, others: Sequence[str], track: _Track, time_ns: _Time, spans: Sequence[_Span]
 ) -> Iterator[LogFrame]:
     latest_ns: dict[str, int] = {}
-    for number, (stamp_ns, rgb) in enumerate(_pictures(bag, images, others, time_ns)):
+    for number, (stamp_ns, rgb) in enumerate(_pictures(bag, images, others, time_ns, spans)):
         place = f"{bag}, image {number}"
         _refuse_going_back(latest_ns, images, stamp_ns, place)
         steering_rad, speed_mps = track.command(stamp_ns)
@@ -221,26 +225,54 @@ def _frames(
 
 
 def _pictures(
-    bag: Path, images: str, others: Sequence[str], time_ns: _Time
+    bag: Path, images: str, others: Sequence[str], time_ns: _Time, spans: Sequence[_Span]
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Time [ns] and RGB ``[H, W, 3]`` of each image."""
     with _naming(others):
-        for message in read_messages(bag, [images], types={images: IMAGE_TYPE}):
-            image = decode(IMAGE_TYPE, message.cdr)
-            yield time_ns(message, image), rgb_image(image, f"{images} in {bag}")
+        for stamp_ns, _, image in _read(bag, {images: IMAGE_TYPE}, time_ns, spans):
+            yield stamp_ns, rgb_image(image, f"{images} in {bag}")
 
 
-def _read_track(bag: Path, steering: str | None, topics: list[str], time_ns: _Time) -> _Track:
+def _spans(info: BagInfo, topics: Sequence[str]) -> list[_Span]:
+    """Spans of log time between which the recorder's clock was set: their order is not that of the drive."""
+    edges_ns = [0, sys.maxsize]
+    if info.duration_s > LONGEST_SILENCE_S:
+        gaps = find_gaps([each.log_ns for each in read_messages(info.path, topics, as_recorded=True)])
+        edges_ns[1:1] = [(gap.before_ns + gap.after_ns) // 2 for gap in gaps]
+    return list(pairwise(edges_ns))
+
+
+def _read(
+    bag: Path, kinds: Mapping[str, str], time_ns: _Time, spans: Sequence[_Span]
+) -> Iterator[tuple[int, str, Any]]:
+    """Time [ns], topic and message in order of the log time, but the spans in order of their first time."""
+    parts = [partial(_read_span, bag, kinds, time_ns, span) for span in spans]
+    if len(parts) > 1:
+        parts.sort(key=lambda part: next((time for time, _, _ in part()), 0))
+    for part in parts:
+        yield from part()
+
+
+def _read_span(
+    bag: Path, kinds: Mapping[str, str], time_ns: _Time, span: _Span
+) -> Iterator[tuple[int, str, Any]]:
+    messages = read_messages(bag, list(kinds), types=kinds)
+    for message in takewhile(lambda each: each.log_ns < span[1], messages):
+        if message.log_ns >= span[0]:
+            decoded = decode(kinds[message.topic], message.cdr)
+            yield time_ns(message, decoded), message.topic, decoded
+
+
+def _read_track(
+    bag: Path, steering: str | None, topics: list[str], time_ns: _Time, spans: Sequence[_Span]
+) -> _Track:
     track = _Track()
-    wanted = [*topics, *([steering] if steering else [])]
-    types = {steering: _ACKERMANN} if steering and steering != _SENT else {}
+    kinds = {topic: topic_row(topic).type for topic in topics}
+    kinds |= {steering: _steering_type(steering)} if steering else {}
     latest_ns: dict[str, int] = {}
-    for message in read_messages(bag, wanted, types=types) if wanted else ():
-        kind = types.get(message.topic) or topic_row(message.topic).type
-        decoded = decode(kind, message.cdr)
-        stamp_ns = time_ns(message, decoded)
-        _refuse_going_back(latest_ns, message.topic, stamp_ns, f"{bag}, {message.topic}")
-        _add(track, message.topic, kind, decoded, stamp_ns)
+    for stamp_ns, topic, message in _read(bag, kinds, time_ns, spans) if kinds else ():
+        _refuse_going_back(latest_ns, topic, stamp_ns, f"{bag}, {topic}")
+        _add(track, topic, kinds[topic], message, stamp_ns)
     for stream in (track.armed, track.sent, track.disturbed):
         stream.sort()
     return track

@@ -122,6 +122,7 @@ def write_ackermann(
     count=6,
     going_back=(),
     depths=(),
+    log_back_ns=0,
 ):
     """A bag of other software: images, and commands of a car.
 
@@ -131,6 +132,7 @@ def write_ackermann(
         step: Steering of an image above that of the one before.
         going_back: Topics whose clock jumps 2 s back before the fourth image.
         depths: Topics with images of depths.
+        log_back_ns: By how much the recorder's clock is set back before the fourth image [ns].
     """
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
@@ -151,7 +153,7 @@ def write_ackermann(
         drives = [writer.add_connection(topic, ACKERMANN, typestore=store) for topic in topics]
         for k in range(count):
             image = make.image(k)
-            t = image.header.stamp.sec * 10**9 + image.header.stamp.nanosec
+            t = image.header.stamp.sec * 10**9 + image.header.stamp.nanosec - (log_back_ns if k >= 3 else 0)
             if "/front/image" in unstamped:
                 image.header.stamp.sec = image.header.stamp.nanosec = 0
             image.header.stamp.sec -= 2 if k >= 3 and "/front/image" in going_back else 0
@@ -202,6 +204,27 @@ def test_two_drives_whose_stamps_overlap_are_not_joined_with_each_other(tmp_path
         LogError, match=rf"drive, {place}: expected stamps that go forward, got one 1\.9 s before"
     ):
         list(log.frames())
+
+
+@pytest.mark.parametrize("form", ["ros1", "ros2"])
+@pytest.mark.parametrize("hours", [2, 9000, -2])
+def test_a_recorder_whose_clock_was_set_does_not_change_the_order_of_the_drive(tmp_path, form, hours):
+    """Stamps are those of the drive; only the log time goes back."""
+    right = list(open_log(write_ackermann(tmp_path / "right", form)).frames())
+    bag = write_ackermann(tmp_path / "drive", form, log_back_ns=hours * 3600 * 10**9)
+    frames = list(open_log(bag).frames())
+    assert [frame.stamp_ns for frame in frames] == [frame.stamp_ns for frame in right]
+    assert [frame.steering for frame in frames] == pytest.approx([0.02 * k for k in range(6)])
+    assert all(np.array_equal(one.image, two.image) for one, two in zip(frames, right, strict=True))
+
+
+def test_two_drives_whose_stamps_overlap_are_refused_after_a_pause_too(tmp_path):
+    both = ("/front/image", "/drive")
+    bag = write_ackermann(
+        tmp_path / "drive", "ros2", count=40, going_back=both, log_back_ns=-2 * 3600 * 10**9
+    )
+    with pytest.raises(LogError, match=r"expected stamps that go forward, got one 1.* s before"):
+        list(open_log(bag).frames())
 
 
 @pytest.mark.parametrize(
