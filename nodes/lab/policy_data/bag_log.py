@@ -208,9 +208,15 @@ def _frames(
     bag: Path, images: str, others: Sequence[str], track: _Track, time_ns: _Time, spans: Sequence[_Span]
 ) -> Iterator[LogFrame]:
     latest_ns: dict[str, int] = {}
+    seen_ns: dict[int, str] = {}
     for number, (stamp_ns, rgb) in enumerate(_pictures(bag, images, others, time_ns, spans)):
         place = f"{bag}, image {number}"
         _refuse_going_back(latest_ns, images, stamp_ns, place)
+        if (earlier := seen_ns.setdefault(stamp_ns, place)) != place and time_ns is _stamped_ns:
+            raise LogError(
+                f"{place}: expected a stamp that no other image has, as it is joined with the steering by it, got that of {earlier}; "
+                "remove one of them, or record again with a stamp for each image"
+            )
         steering_rad, speed_mps = track.command(stamp_ns)
         yield LogFrame(
             rgb,

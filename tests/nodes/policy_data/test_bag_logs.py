@@ -123,6 +123,7 @@ def write_ackermann(
     going_back=(),
     depths=(),
     log_back_ns=0,
+    repeated=(),
 ):
     """A bag of other software: images, and commands of a car.
 
@@ -133,6 +134,7 @@ def write_ackermann(
         going_back: Topics whose clock jumps 2 s back before the fourth image.
         depths: Topics with images of depths.
         log_back_ns: By how much the recorder's clock is set back before the fourth image [ns].
+        repeated: Images with the stamp of the one before.
     """
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
@@ -157,6 +159,8 @@ def write_ackermann(
             if "/front/image" in unstamped:
                 image.header.stamp.sec = image.header.stamp.nanosec = 0
             image.header.stamp.sec -= 2 if k >= 3 and "/front/image" in going_back else 0
+            if k in repeated:
+                image.header.stamp = make.header(k - 1, "camera").stamp
             writer.write(images, t, pack(image, IMAGE))
             image.encoding = "32FC1"
             for depth in depth_images:
@@ -225,6 +229,14 @@ def test_two_drives_whose_stamps_overlap_are_refused_after_a_pause_too(tmp_path)
     )
     with pytest.raises(LogError, match=r"expected stamps that go forward, got one 1.* s before"):
         list(open_log(bag).frames())
+
+
+@pytest.mark.parametrize(("repeated", "first"), [((1, 3, 5), 1), ((4,), 4)])
+def test_an_image_with_the_stamp_of_another_is_refused(tmp_path, repeated, first):
+    log = open_log(write_ackermann(tmp_path / "drive", "ros2", repeated=repeated))
+    said = rf"image {first}: expected a stamp that no other image has.* got that of \S*drive, image {first - 1}; remove"
+    with pytest.raises(LogError, match=said):
+        list(log.frames())
 
 
 @pytest.mark.parametrize(
