@@ -125,6 +125,7 @@ class DriveLog:
         attached: Reads attached files by name, such as ``camera.yaml``.
         unchecked: Why damage may go unnoticed; empty if checksums cover the log.
         joined_by: What images and steering were joined by, if not by capture stamps, and why.
+        without_controls: What a log of this format has and needs, if there are no controls.
     """
 
     path: Path
@@ -144,6 +145,14 @@ class DriveLog:
     attached: Callable[[], Mapping[str, bytes]] = dict
     unchecked: str = ""
     joined_by: str = ""
+    without_controls: str = "the log has no numbers"
+
+    @property
+    def steering_advice(self) -> str:
+        """What to do about a log in which no steering was found."""
+        return (
+            f"name it with --steering: {', '.join(self.controls)}" if self.controls else self.without_controls
+        )
 
     @property
     def rate_in_words(self) -> str:

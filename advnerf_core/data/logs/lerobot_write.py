@@ -81,9 +81,7 @@ def write_lerobot(
     if folder.exists():
         raise LogError(f"{folder} exists; remove it or choose another folder with --output")
     if log.unit is None:
-        raise LogError(
-            f"expected steering in {log.path}, found none; name it with --steering, it has {', '.join(log.controls) or 'none'}"
-        )
+        raise LogError(f"expected steering in {log.path}, found none; {log.steering_advice}")
     rate_hz = _rate_of(log, rate_hz)
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     shutil.rmtree(partial, ignore_errors=True)

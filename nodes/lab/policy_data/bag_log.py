@@ -7,6 +7,7 @@ radians, left positive, by definition of the message. The velocities of a ``Twis
 from __future__ import annotations
 
 import math
+import re
 import sys
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -46,6 +47,7 @@ CAR_TOPIC = "/vicon/car"
 _SAFETY, _SENT, _EXPERT = "/safety/state", "/motor/sent", "/expert/state"
 _IMAGES = ("/compositor/image", *CAMERA_TOPICS)
 _ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
+_LIKE_STEERING = re.compile("ackermann|twist|float|steer|drive|control|cmd", re.IGNORECASE)
 _JOIN_S = 0.12
 _MOST_BACK_S = 1.0  # messages of one topic may overtake each other, but no clock of a drive goes back
 _TIMED = 200  # images from which the rate is determined
@@ -104,6 +106,11 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
     images = chosen_name(choice.images, cameras, "images", bag)
     controls = tuple(name for name, kind in typed.items() if name == _SENT or kind == _ACKERMANN)
     controls = tuple(sorted(controls, key=lambda name: (name != _SENT, name)))
+    without_controls = _without_controls(typed)
+    if choice.steering is not None and not controls:
+        raise LogError(
+            f"expected a topic with wheel angles in {bag}, got {choice.steering}; {without_controls}"
+        )
     steering = _steering_topic(choice.steering, controls, bag)
     joined = [name for name in (CAR_TOPIC, _SAFETY, _EXPERT) if name in counts]
     kinds = {images: IMAGE_TYPE, **({steering: _steering_type(steering)} if steering else {})}
@@ -132,6 +139,7 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
         joined_by=f"times of recording, as all stamps on {' and '.join(unstamped)} are equal"
         if unstamped
         else "",
+        without_controls=without_controls,
     )
 
 
@@ -159,6 +167,19 @@ def _steering_topic(wanted: str | None, controls: tuple[str, ...], bag: Path) ->
     if wanted is not None or _SENT in controls or len(controls) == 1:
         return chosen_name(wanted, controls, "a topic with wheel angles", bag)
     return None
+
+
+def _without_controls(types: Mapping[str, str]) -> str:
+    """What to do about a bag without wheel angles.
+
+    Args:
+        types: Types by topic.
+    """
+    others = [f"{name} ({kind})" for name, kind in types.items() if _LIKE_STEERING.search(f"{name} {kind}")]
+    return (
+        f"wheel angles are read from {_ACKERMANN}, the bag has {', '.join(others) or 'nothing like it'}; "
+        "convert the messages, or write the images and a CSV file with the wheel angles"
+    )
 
 
 def _steering_type(topic: str) -> str:

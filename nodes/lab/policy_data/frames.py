@@ -164,10 +164,7 @@ def _require_labels(log: DriveLog, expert: Expert | None, labels: Labels) -> Non
             f"expected poses in {log.path} for the expert's labels, got none; use --labels recorded"
         )
     if labels == "recorded" and log.unit is None:
-        raise LogError(
-            f"expected recorded steering in {log.path}, found none; "
-            f"name it with --steering, it has {', '.join(log.controls) or 'no controls'}"
-        )
+        raise LogError(f"expected recorded steering in {log.path}, found none; {log.steering_advice}")
 
 
 def _unusable(frame: LogFrame, expert: Expert | None, labels: Labels) -> str:

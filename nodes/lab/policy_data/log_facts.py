@@ -61,7 +61,7 @@ class LogFacts:
         """Why the recorded steering teaches nothing; empty if it does."""
         log = self.log
         if log.unit is None:
-            return f"no steering found; name it with --steering: {', '.join(log.controls) or 'the log has no numbers'}"
+            return f"no steering found; {log.steering_advice}"
         if not len(self.steering):
             return f"{log.unit.name} has no value"
         if float(self.steering.std()) < _STEADY:

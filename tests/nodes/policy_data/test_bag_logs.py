@@ -1,5 +1,7 @@
 """Bags as logs: ours exported and read again, and those of other software with Ackermann commands."""
 
+import re
+
 import numpy as np
 import pytest
 from rosbags import rosbag1, rosbag2
@@ -7,6 +9,7 @@ from rosbags.rosbag2.writer import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from advnerf_core.data.logs.choice import LogChoice, LogError
+from advnerf_core.data.logs.lerobot_write import write_lerobot
 from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole
@@ -98,8 +101,6 @@ def test_a_bag_that_was_exported_gives_the_same_frames(tmp_path, monkeypatch, la
 
 def test_an_export_has_an_episode_for_each_drive_and_never_replaces_one(tmp_path):
     pq = pytest.importorskip("pyarrow.parquet")
-    from advnerf_core.data.logs.lerobot_write import write_lerobot
-
     log = open_log(write_bag(tmp_path / "bag"))
     done = write_lerobot(log, tmp_path / "set")
     assert (done.frames, done.episodes, done.rate_hz, done.left_out) == (COUNT - 1, 3, 10, 1)
@@ -124,6 +125,7 @@ def write_ackermann(
     depths=(),
     log_back_ns=0,
     repeated=(),
+    kind=ACKERMANN,
 ):
     """A bag of other software: images, and commands of a car.
 
@@ -134,6 +136,7 @@ def write_ackermann(
         going_back: Topics whose clock jumps 2 s back before the fourth image.
         depths: Topics with images of depths.
         log_back_ns: By how much the recorder's clock is set back before the fourth image [ns].
+        kind: Type of the commands.
         repeated: Images with the stamp of the one before.
     """
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
@@ -152,7 +155,7 @@ def write_ackermann(
     with writer:
         images = writer.add_connection("/front/image", IMAGE, typestore=store)
         depth_images = [writer.add_connection(topic, IMAGE, typestore=store) for topic in depths]
-        drives = [writer.add_connection(topic, ACKERMANN, typestore=store) for topic in topics]
+        drives = [writer.add_connection(topic, kind, typestore=store) for topic in topics]
         for k in range(count):
             image = make.image(k)
             t = image.header.stamp.sec * 10**9 + image.header.stamp.nanosec - (log_back_ns if k >= 3 else 0)
@@ -167,6 +170,10 @@ def write_ackermann(
                 writer.write(depth, t, pack(image, IMAGE))
             for topic, drive in zip(topics, drives, strict=True):
                 command = store.types[DRIVE](step * k, 0.0, 1.5, 0.0, 0.0)
+                if kind != ACKERMANN:
+                    other = command if kind == DRIVE else store.types[kind](step * k)
+                    writer.write(drive, t + late_ns, pack(other, kind))
+                    continue
                 message = store.types[ACKERMANN](header=make.header(k, "car"), drive=command)
                 message.header.stamp.sec += late_ns // 10**9 - (2 if k >= 3 and topic in going_back else 0)
                 if topic in unstamped:
@@ -256,6 +263,22 @@ def test_a_log_that_training_refuses_is_not_promised(tmp_path, change, told):
     assert (learned.why, evaluated.why) == (told, told)
     facts = read_facts(open_log(write_ackermann(tmp_path / "right", "ros2", count=20)))
     assert [each.possible for each in facts.verdicts()][::2] == [True, True]
+
+
+@pytest.mark.parametrize("kind", [DRIVE, "std_msgs/msg/Float64"])
+def test_steering_of_another_type_is_named_with_the_type_that_is_read(tmp_path, kind):
+    bag = write_ackermann(tmp_path / "drive", "ros2", ("/steer",), kind=kind)
+    said = f"wheel angles are read from {ACKERMANN}, the bag has /steer ({kind}); convert the messages"
+    learned, _, evaluated = read_facts(open_log(bag)).verdicts()
+    assert said in learned.why
+    assert said in evaluated.why
+    for refused in (
+        lambda: open_log(bag, LogChoice(steering="/steer")),
+        lambda: frames_of(open_log(bag), VIEW, None, "recorded"),
+        lambda: write_lerobot(open_log(bag), tmp_path / "set"),
+    ):
+        with pytest.raises(LogError, match=re.escape(said)):
+            refused()
 
 
 def test_of_two_topics_with_commands_none_is_taken_unasked(tmp_path):

@@ -138,7 +138,7 @@ def test_which_number_of_a_lerobot_data_set_is_the_steering_is_not_guessed(tmp_p
     folder = write_lerobot_3(tmp_path / "log", names=("curvature", "speed"))
     log = open_log(folder)
     assert (log.unit, log.controls) == (None, ("action:curvature", "action:speed"))
-    with pytest.raises(LogError, match="name it with --steering, it has action:curvature, action:speed"):
+    with pytest.raises(LogError, match="name it with --steering: action:curvature, action:speed"):
         frames_of(log, view_for_size(64, 48), None, "recorded")
     assert open_log(folder, LogChoice(steering="action:curvature")).steering()[0] == pytest.approx(value(0))
     with pytest.raises(LogError, match="expected steering action:7"):
@@ -394,7 +394,10 @@ def test_a_bag_says_what_it_lacks(tmp_path):
     assert facts.log.poses == facts.log.count > 0
     policy, scene, evaluation = facts.verdicts()
     assert (policy.possible, scene.possible, evaluation.possible) == (True, False, False)
-    assert "no steering found; name it with --steering: the log has no numbers" in evaluation.why
+    assert (
+        "no steering found; wheel angles are read from ackermann_msgs/msg/AckermannDriveStamped, the bag has nothing like it"
+        in evaluation.why
+    )
 
 
 def test_the_commands_train_on_several_logs_and_evaluate_held_out_frames(tmp_path, monkeypatch, capsys):
