@@ -16,6 +16,7 @@ from advnerf_core.data.logs.choice import LogChoice, LogError, Side
 
 Labels = Literal["expert", "recorded"]
 FASTEST_HZ = 1000.0  # no camera is faster; such times have another unit
+NO_COMMAND = "no command"
 NOWHERE = (math.nan, math.nan, math.nan)
 # Of front wheels: at this angle and above, a value is in degrees, or in another unit.
 _STEEPEST_RAD = 1.0
@@ -175,6 +176,26 @@ class DriveLog:
         for frame in self.frames():
             return frame.image
         raise LogError(f"expected images in {self.path}, got none; record more")
+
+
+def too_few_frames(log: DriveLog, least: int, got: int, left_out: Mapping[str, int]) -> LogError:
+    """The error about a log with too few usable frames.
+
+    Args:
+        left_out: Numbers of other images, by reason.
+    """
+    why = ", ".join(f"{count} {reason}" for reason, count in left_out.items() if count)
+    advice = "record more"
+    if left_out.get(NO_COMMAND, 0) > got:
+        times_differ = np.isfinite(log.steering()).sum() > got
+        advice = (
+            "their times and those of the steering differ: record again with one clock"
+            if times_differ
+            else "record the steering too, as a number for each image"
+        )
+    return LogError(
+        f"expected at least {least} usable frames in {log.path}, got {got} ({why or 'no other images'}); {advice}"
+    )
 
 
 def refuse_repeated_images(images: Iterable[tuple[str, Path]]) -> None:

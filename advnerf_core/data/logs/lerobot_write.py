@@ -6,6 +6,7 @@ import json
 import math
 import os
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.data.image_files import Rgb
 from advnerf_core.data.logs.choice import LogError
-from advnerf_core.data.logs.drive_log import FASTEST_HZ, DriveLog, LogFrame
+from advnerf_core.data.logs.drive_log import FASTEST_HZ, NO_COMMAND, DriveLog, LogFrame, too_few_frames
 from advnerf_core.data.logs.lerobot import (
     ATTACHED,
     DISTURBED,
@@ -115,13 +116,14 @@ def _write(log: DriveLog, folder: Path, rate_hz: int, report: Report) -> Exporte
     rows: list[_Row] = []
     shapes: list[tuple[int, ...]] = []
     sample: list[Rgb] = []
+    left_out = Counter(log.left_out)
     every = max(log.count // _STATISTICS_OF, 1)
     (folder / "meta").mkdir(parents=True)
     video = folder / f"videos/{CAMERA}/{_FILE}.mp4"
     video.parent.mkdir(parents=True)
 
     def images() -> Iterator[Rgb]:
-        for row, frame in _usable(log, rate_hz):
+        for row, frame in _usable(log, rate_hz, left_out):
             if shapes and frame.image.shape != shapes[0]:
                 raise LogError(
                     f"{frame.place}: expected images of one size, got {frame.image.shape[:2]} after {shapes[0][:2]}"
@@ -135,9 +137,7 @@ def _write(log: DriveLog, folder: Path, rate_hz: int, report: Report) -> Exporte
 
     _encode(video, images(), rate_hz)
     if len(rows) < _LEAST_IMAGES:
-        raise LogError(
-            f"expected at least {_LEAST_IMAGES} frames with steering in {log.path}, got {len(rows)} of {log.count}"
-        )
+        raise too_few_frames(log, _LEAST_IMAGES, len(rows), left_out)
     columns = _columns(rows, rate_hz)
     _write_table(folder / f"data/{_FILE}.parquet", columns)
     episodes = _write_episodes(folder, rows, rate_hz)
@@ -149,8 +149,12 @@ def _write(log: DriveLog, folder: Path, rate_hz: int, report: Report) -> Exporte
     return Exported(len(rows), episodes, rate_hz, log.count - len(rows))
 
 
-def _usable(log: DriveLog, rate_hz: int) -> Iterator[tuple[_Row, LogFrame]]:
-    """Frames with steering. A pause, times that go back, or frames left out in between, start another episode."""
+def _usable(log: DriveLog, rate_hz: int, left_out: Counter[str]) -> Iterator[tuple[_Row, LogFrame]]:
+    """Frames with steering. A pause, times that go back, or frames left out in between, start another episode.
+
+    Args:
+        left_out: Numbers of other frames by reason; updated.
+    """
     assert log.unit is not None
     episode = number = -1
     last_ns: float = -math.inf
@@ -158,6 +162,7 @@ def _usable(log: DriveLog, rate_hz: int) -> Iterator[tuple[_Row, LogFrame]]:
     skipped = True
     for frame in log.frames():
         if frame.unusable or math.isnan(frame.steering):
+            left_out[frame.unusable or NO_COMMAND] += 1
             skipped = True
             continue
         paused = timed and abs(frame.stamp_ns - last_ns) > _GAP_FRAMES * 1e9 / rate_hz

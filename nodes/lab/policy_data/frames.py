@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.data.logs.choice import LogError
-from advnerf_core.data.logs.drive_log import FASTEST_HZ, DriveLog, Labels, LogFrame
+from advnerf_core.data.logs.drive_log import (
+    FASTEST_HZ,
+    NO_COMMAND,
+    DriveLog,
+    Labels,
+    LogFrame,
+    too_few_frames,
+)
 from advnerf_core.driving.expert import Expert
 from advnerf_core.geometry import Pinhole
 from advnerf_core.learning.frames import Frames, FrameSet
@@ -71,7 +78,7 @@ def frames_of(log: DriveLog, view: PolicyView, expert: Expert | None, labels: La
         LogError: The log lacks poses or controls for the labels, or has too few usable frames.
     """
     _require_labels(log, expert, labels)
-    counts = dict.fromkeys(("not armed", "no pose", "no command", "disturbed", "too far from the path"), 0)
+    counts = dict.fromkeys(("not armed", "no pose", NO_COMMAND, "disturbed", "too far from the path"), 0)
     counts |= {reason: int(count) for reason, count in log.left_out.items()}
     images, states, steering, recorded, stamps = [], [], [], [], []
     for frame in log.frames():
@@ -88,10 +95,7 @@ def frames_of(log: DriveLog, view: PolicyView, expert: Expert | None, labels: La
             sent_rad if labels == "recorded" or expert is None else float(expert.steer(*frame.state))
         )
     if len(images) < LEAST_FRAMES:
-        why = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
-        raise LogError(
-            f"expected at least {LEAST_FRAMES} usable frames in {log.path}, got {len(images)} ({why or 'no other images'}); record more"
-        )
+        raise too_few_frames(log, LEAST_FRAMES, len(images), counts)
     count = len(images)
     frames = Frames(
         np.stack(images),
@@ -172,7 +176,7 @@ def _unusable(frame: LogFrame, expert: Expert | None, labels: Labels) -> str:
     if frame.unusable:
         return frame.unusable
     if labels == "recorded":
-        return "no command" if math.isnan(frame.steering) else "disturbed" if frame.disturbed else ""
+        return NO_COMMAND if math.isnan(frame.steering) else "disturbed" if frame.disturbed else ""
     if math.isnan(frame.state[0]):
         return "no pose"
     far = expert is not None and abs(float(expert.path.project(np.array(frame.state[:2])).cte_m)) > _GIVE_UP_M

@@ -265,6 +265,21 @@ def test_a_log_that_training_refuses_is_not_promised(tmp_path, change, told):
     assert [each.possible for each in facts.verdicts()][::2] == [True, True]
 
 
+def test_a_drive_whose_clocks_differ_is_answered_with_the_times(tmp_path):
+    log = open_log(write_ackermann(tmp_path / "drive", "ros2", count=20, late_ns=3600 * 10**9))
+    for use in (lambda: frames_of(log, VIEW, None, "recorded"), lambda: write_lerobot(log, tmp_path / "set")):
+        with pytest.raises(
+            LogError, match=r"got 0 \(20 no command\); their times and those of the steering differ"
+        ):
+            use()
+    empty = open_log(write_ackermann(tmp_path / "empty", "ros2", count=20, step=np.nan))
+    with pytest.raises(LogError, match=r"got 0 \(20 no command\); record the steering too"):
+        frames_of(empty, VIEW, None, "recorded")
+    short = open_log(write_ackermann(tmp_path / "short", "ros2", count=3))
+    with pytest.raises(LogError, match=r"got 3 \(no other images\); record more"):
+        write_lerobot(short, tmp_path / "set")
+
+
 @pytest.mark.parametrize("kind", [DRIVE, "std_msgs/msg/Float64"])
 def test_steering_of_another_type_is_named_with_the_type_that_is_read(tmp_path, kind):
     bag = write_ackermann(tmp_path / "drive", "ros2", ("/steer",), kind=kind)
