@@ -38,7 +38,7 @@ def clean(splats: GaussianSplats, floaters: bool = True) -> tuple[GaussianSplats
         floaters: Whether to remove those far from all others.
 
     Raises:
-        SplatError: Fewer than half of them have valid numbers, or none can be seen.
+        SplatError: Fewer than half of them have valid numbers, or none are left.
     """
     removed: list[Removed] = []
     count = len(splats)
@@ -61,8 +61,6 @@ def clean(splats: GaussianSplats, floaters: bool = True) -> tuple[GaussianSplats
     splats = _without(
         splats, splats.opacities < LEAST_ALPHA, "opacity below 1/255, which is never drawn", removed
     )
-    if len(splats) == 0:
-        raise SplatError("expected Gaussians that can be seen, got all with an opacity below 1/255")
     low, high = central_box(splats)
     extent, centre = float((high - low).max()), 0.5 * (low + high)
     away = np.abs(splats.means_m - centre).max(axis=1)
@@ -86,9 +84,14 @@ def central_box(splats: GaussianSplats) -> tuple[Array, Array]:
 def _without(
     splats: GaussianSplats, which: NDArray[np.bool_], reason: str, removed: list[Removed]
 ) -> GaussianSplats:
-    if not which.any():
+    if not which.any() and len(splats) > 0:
         return splats
     removed.append(Removed(int(which.sum()), reason))
+    if which.all():
+        reasons = "; ".join(f"{each.count:,} for {each.reason}" for each in removed)
+        raise SplatError(
+            f"expected Gaussians that can be drawn, got none after leaving out {reasons}; export it again"
+        )
     return splats.chosen(~which)
 
 

@@ -18,6 +18,7 @@ Array32 = NDArray[np.float32]
 
 CONSTANT_BASIS = 0.28209479177387814  # the spherical harmonic of degree 0
 COLOUR_OFFSET = 0.5
+FOR_A_MESH = "of a mesh, 'advnerf scene object build' makes an object"
 
 
 class SplatError(AdvnerfError):

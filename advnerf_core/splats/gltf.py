@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from advnerf_core.data.similarity import Similarity
 from advnerf_core.fields.spherical_harmonics import MAX_BANDS
 from advnerf_core.geometry import Array, make_transform
-from advnerf_core.splats.gaussians import GaussianSplats, SplatError
+from advnerf_core.splats.gaussians import FOR_A_MESH, GaussianSplats, SplatError
 
 EXTENSION = "KHR_gaussian_splatting"
 _PREFIX = f"{EXTENSION}:"
@@ -73,7 +73,7 @@ def read_gltf(path: Path) -> Parts:
         raise ValueError(f"attributes that are not there ({broken[0]})")
     if not found:
         raise SplatError(
-            f"expected Gaussians ({EXTENSION}) in {path}, got none; give the splat instead of a mesh or a point cloud"
+            f"expected Gaussians ({EXTENSION}) in {path}, got none; give the splat instead of a point cloud; {FOR_A_MESH}"
         )
     parts: list[GaussianSplats] = []
     for node in scene.graph.nodes_geometry:

@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.splats.gaussians import COLOUR_OFFSET, CONSTANT_BASIS, GaussianSplats, SplatError
+from advnerf_core.splats.gaussians import (
+    COLOUR_OFFSET,
+    CONSTANT_BASIS,
+    FOR_A_MESH,
+    GaussianSplats,
+    SplatError,
+)
 
 MOST_GAUSSIANS = 20_000_000
 _RECORD = np.dtype(
@@ -50,7 +56,7 @@ def read_splats(path: Path) -> GaussianSplats:
         ".glb": _glb,
     }
     if path.suffix.lower() not in readers:
-        raise SplatError(f"expected a splat file {', '.join(readers)}, got {path}")
+        raise SplatError(f"expected a splat file {', '.join(readers)}, got {path}; {FOR_A_MESH}")
     if not path.is_file():
         raise SplatError(f"expected a splat file at {path}, found none")
     try:
@@ -64,8 +70,7 @@ def read_splats(path: Path) -> GaussianSplats:
         raise SplatError(
             f"expected {path} to be a splat, got a damaged file ({why}); export it again"
         ) from error
-    if len(found) == 0:
-        raise SplatError(f"expected Gaussians in {path}, got none")
+    _require_count(path, len(found))
     return found
 
 
@@ -130,7 +135,7 @@ def _splat(path: Path) -> GaussianSplats:
 def _glb(path: Path) -> GaussianSplats:
     from advnerf_core.splats.gltf import read_gltf
 
-    _require_count(path, path.stat().st_size // _RECORD.itemsize)
+    _require_count(path, max(1, path.stat().st_size // _RECORD.itemsize))
     return _gaussians(*read_gltf(path))
 
 
@@ -146,6 +151,8 @@ def _gaussians(means: Any, scales: Any, rotations: Any, opacities: Any, harmonic
 
 
 def _require_count(path: Path, count: int) -> None:
+    if count == 0:
+        raise SplatError(f"expected Gaussians in {path}, got none, as it has no points; export it again")
     if count > MOST_GAUSSIANS:
         raise SplatError(
             f"expected at most {MOST_GAUSSIANS:,} Gaussians in {path}, got {count:,}; prune it, or cut out the part that is driven through"
@@ -165,8 +172,6 @@ def _check_ply(path: Path) -> None:
     words = [line.split() for line in lines.decode("ascii").splitlines()]
     if not words or words[0] != ["ply"] or not end:
         raise ValueError("no PLY header")
-    if ["format", "binary_little_endian", "1.0"] not in words:
-        raise ValueError("not in the format binary_little_endian 1.0")
     elements: dict[str, int] = {}
     properties: dict[str, list[tuple[str, str]]] = {}
     name = ""
@@ -175,7 +180,17 @@ def _check_ply(path: Path) -> None:
             name = line[1]
             elements[name], properties[name] = int(line[2]), []
         elif line[:1] == ["property"]:
-            properties[name].append((line[1], line[2]))
+            properties[name].append((line[1], line[-1]))
+    names = {each for _, each in properties.get("vertex", [])}
+    if "chunk" not in elements and not {"opacity", "scale_0", "rot_0", "f_dc_0"} <= names:
+        if elements.get("face", 0) > 0:
+            raise SplatError(f"expected Gaussians in {path}, got a mesh of triangles; {FOR_A_MESH}")
+        raise SplatError(
+            f"expected Gaussians in {path}, got points with {', '.join(sorted(names)) or 'nothing'}; give the splat that was trained from them"
+        )
+    if ["format", "binary_little_endian", "1.0"] not in words:
+        raise ValueError("not in the format binary_little_endian 1.0")
+    _require_count(path, elements.get("vertex", 0))
     _require_count(path, max(elements.values(), default=0))
     if min(elements.values(), default=0) < 0:
         raise ValueError("a negative number of elements")
@@ -184,13 +199,8 @@ def _check_ply(path: Path) -> None:
     )
     if len(lines) + len(end) + 1 + needed > path.stat().st_size:
         raise ValueError(f"{needed} bytes of data in the header, fewer in the file")
-    names = {each for _, each in properties.get("vertex", [])}
     if "chunk" in elements:
         if _CHUNK * elements["chunk"] < elements.get("vertex", 0):
             raise ValueError(f"{elements['chunk']} chunks for {elements.get('vertex', 0)} Gaussians")
-    elif not {"opacity", "scale_0", "rot_0", "f_dc_0"} <= names:
-        raise SplatError(
-            f"expected Gaussians in {path}, got points with {', '.join(sorted(names)) or 'nothing'}; give the splat that was trained from them"
-        )
     elif {kind for kind, _ in properties["vertex"]} - {"float", "float32"}:
         raise ValueError("properties that are not float")

@@ -48,5 +48,14 @@ def test_a_splat_that_is_mostly_damaged_or_invisible_is_refused():
     splats.means_m[:60] = np.nan
     with pytest.raises(SplatError, match="in 60 of 100 Gaussians; export it again"):
         clean(splats)
-    with pytest.raises(SplatError, match="that can be seen"):
+    with pytest.raises(SplatError, match="none after leaving out 3 for opacity below 1/255"):
         clean(gaussians(np.zeros((3, 3)), 0.1, 0.001, np.ones((3, 3))))
+
+
+def test_a_splat_whose_sizes_are_all_wild_is_refused_with_every_reason():
+    splats = random_splats(100)
+    splats.opacities[:10], splats.opacities[10:] = 0.001, 1.0
+    splats.scales_m[:, 0] = 3000.0
+    splats.scales_m[:, 1:] = 0.01
+    with pytest.raises(SplatError, match=r"10 for opacity below 1/255.*; 90 for sizes beyond 10 times"):
+        clean(splats)

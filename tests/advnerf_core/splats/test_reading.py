@@ -239,6 +239,28 @@ def test_a_cloud_of_points_is_no_splat(tmp_path):
     refuse(tmp_path, header.encode() + bytes(12), "points with x, y, z; give the splat", "ply")
 
 
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_a_mesh_is_told_from_a_damaged_splat(tmp_path, form):
+    content = (
+        f"ply\nformat {form} 1.0\nelement vertex 8\nproperty float x\nelement face 12\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    refuse(tmp_path, content.encode(), "a mesh of triangles; .*scene object build", "ply")
+    refuse(tmp_path, b"solid", "expected a splat file .*scene object build", "stl")
+
+
+@pytest.mark.parametrize("kind", ["ply", "splat", "spz"])
+def test_a_splat_without_points_is_no_damaged_file(tmp_path, kind):
+    write_ply(tmp_path / "one.ply", random_splats(1, bands=1))
+    header = (tmp_path / "one.ply").read_bytes().partition(b"end_header\n")
+    contents = {
+        "ply": header[0].replace(b"element vertex 1", b"element vertex 0") + header[1],
+        "splat": b"",
+        "spz": gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 0, 0, 12, 0, 0)),
+    }
+    refuse(tmp_path, contents[kind], "got none, as it has no points", kind)
+
+
 def test_ply_files_that_the_library_would_read_wrongly_are_refused(tmp_path):
     good = write_ply(tmp_path / "good.ply", random_splats(20)).read_bytes()
     refuse(tmp_path, good.replace(b"property float opacity", b"property uchar opacity"), "not float", "ply")
