@@ -17,17 +17,11 @@ Reason = Annotated[str, typer.Option("--reason", help="Reason to record.")]
 
 def arm(run_dir: RunDir = None, reason: Reason = "") -> None:
     """Ask the safety node of a running launch to arm the car. Asks first if the launch was not started in this folder."""
-    from nodes.launching.launch_hosts import GATEWAY
-    from nodes.launching.launched import read_launched
-    from nodes.launching.running import has_ended
+    from nodes.launching.watching import require_running
     from nodes.runtime.arm_requests import ask_to_arm
-    from nodes.runtime.errors import LaunchError
 
     run = _run_to_arm(run_dir)
-    if has_ended(run) and GATEWAY not in read_launched(run).nodes:  # the safety node may run on another host
-        raise LaunchError(
-            f"expected a running launch in {run}, but all of its nodes have ended, so nothing can be armed; start it with advnerf launch"
-        )
+    require_running(run)
     answer = ask_to_arm(run, reason)
     if answer.granted and answer.armed:
         print(f"armed by {answer.text}")

@@ -10,7 +10,7 @@ import typer
 
 from nodes.cli.replay import replay
 from nodes.cli.trial import evaluate
-from nodes.runtime.terminal import RunDir, Topics, fail_unless, print_table, say_error, table
+from nodes.runtime.terminal import FAILURE_EXIT, RunDir, Topics, fail_unless, print_table, say_error, table
 
 if TYPE_CHECKING:
     from nodes.bags.info import BagInfo
@@ -151,6 +151,7 @@ def bag_record(
     """Record the topics of a running launch until Ctrl-C."""
     from nodes.launching.watching import find_run_dir, node_names
     from nodes.recorder import RecorderConfig, RecorderNode
+    from nodes.runtime.node import NodeContext
     from nodes.runtime.paths import require_new
     from nodes.runtime.process import run_node
 
@@ -162,7 +163,17 @@ def bag_record(
     limits = {"max_bag_duration_s": max_bag_duration_s, "max_bag_size_mb": max_bag_size_mb}
     config = config.model_copy(update={key: value for key, value in limits.items() if value is not None})
     print(f"recording to {folder}; press Ctrl-C to stop", flush=True)
-    raise typer.Exit(run_node(lambda context: RecorderNode.build(config, context), "bag_record", run))
+    built: list[RecorderNode] = []
+
+    def build(context: NodeContext) -> RecorderNode:
+        built.append(RecorderNode.build(config, context))
+        return built[0]
+
+    code = run_node(build, "bag_record", run)
+    if code == 0 and built and built[0].messages == 0:
+        say_error(f"recorded 0 messages in {folder}: no node has published a topic to record")
+        code = FAILURE_EXIT
+    raise typer.Exit(code)
 
 
 @app.command("play")
@@ -207,12 +218,13 @@ def bag_play(
     Keys in the terminal: space pauses and resumes, right arrow or s steps, + and - change the speed, q quits.
     From another terminal: advnerf bag control pause|resume|toggle|step [N]|rate X|stop.
     """
+    import shutil
     import sys
 
     from nodes.bags.keys import HELP
     from nodes.launching.watching import find_run_dir
     from nodes.player import PlayerConfig, PlayerNode
-    from nodes.runtime.process import run_node
+    from nodes.runtime.process import WRONG_REQUEST, run_node
 
     waiting = [] if no_wait else wait_for or None
     config = PlayerConfig(
@@ -227,15 +239,17 @@ def bag_play(
         clock_hz=clock_hz,
         wait_for=waiting,
     )
+    is_new = run_dir is not None and not run_dir.exists()
     if run_dir is not None:
         run_dir.mkdir(parents=True, exist_ok=True)
-    run = find_run_dir(run_dir)
+    run = run_dir or find_run_dir(None)
     terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
     if terminal is not None:
         print(HELP, flush=True)
-    raise typer.Exit(
-        run_node(lambda context: PlayerNode(config, context.subscribers, terminal), "bag_play", run)
-    )
+    code = run_node(lambda context: PlayerNode(config, context.subscribers, terminal), "bag_play", run)
+    if code == WRONG_REQUEST and is_new:
+        shutil.rmtree(run, ignore_errors=True)
+    raise typer.Exit(code)
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from nodes.launching.launch_hosts import GATEWAY
 from nodes.launching.launched import read_launched
-from nodes.launching.running import active_launches, is_running
+from nodes.launching.running import active_launches, has_ended, is_running
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import LaunchError, MessageError
 from nodes.runtime.messages import stamp_ns
-from nodes.runtime.paths import bus_folder
+from nodes.runtime.paths import RESOLVED_NAME, bus_folder
 from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
 
@@ -69,10 +70,16 @@ class RateReport:
 
 
 def find_run_dir(given: Path | None) -> Path:
-    """Return the given run folder, or the only running launch's."""
+    """Return the given run folder, or the only running launch's.
+
+    Raises:
+        LaunchError: There is none, more than one, or the given one is of a launch that has ended.
+    """
     if given is not None:
         if not given.is_dir():
             raise LaunchError(f"expected a run folder at {given}, found none; correct --folder")
+        if (given / RESOLVED_NAME).exists():
+            require_running(given)
         return given
     launches = active_launches()
     if not launches:
@@ -85,6 +92,14 @@ def find_run_dir(given: Path | None) -> Path:
             f"expected one running launch, found {len(launches)} ({found}); select one with --folder"
         )
     return Path(launches[0]["run_dir"])
+
+
+def require_running(run_dir: Path) -> None:
+    """Raise `LaunchError` if no node is left in a run folder; those on another host are reached by a gateway."""
+    if has_ended(run_dir) and GATEWAY not in read_launched(run_dir).nodes:
+        raise LaunchError(
+            f"expected a running launch in {run_dir}, but all of its nodes have ended; start it with advnerf launch"
+        )
 
 
 def node_names(run_dir: Path) -> list[str]:

@@ -26,6 +26,8 @@ from nodes.runtime.prepare import prepare_process
 from nodes.runtime.topics import status_topic
 
 C = TypeVar("C", bound=BaseModel)
+WRONG_REQUEST = 2
+"""Exit code of a node that cannot be built with its configuration."""
 # Errors of a node's `build` that the user can fix. They are printed without a traceback.
 _WRONG_REQUEST = (BagError, ConfigError, TopicError)
 
@@ -124,7 +126,7 @@ class _Runner:
 
     def fail(self, error: Exception) -> None:
         if self.loop is None and isinstance(error, _WRONG_REQUEST):
-            self.exit_code = 2
+            self.exit_code = WRONG_REQUEST
             print(f"{self._name}: {_one_line(error)}", file=sys.stderr, flush=True)
             return
         self.exit_code = 1

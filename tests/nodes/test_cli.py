@@ -15,7 +15,9 @@ from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
 from nodes.cli.endings import text_for_people
 from nodes.launching.watching import describe
+from nodes.runtime.clock import SystemClock
 from nodes.runtime.messages import encode, pose_message
+from nodes.runtime.node import NodeContext
 from tests.support.waiting import wait_for
 
 SENDER = """
@@ -251,6 +253,42 @@ def test_launch_check_starts_nothing(folder):
     assert (process.returncode, but_for_code(errors)) == (0, "")
     assert "sender_node" in output
     assert "{'rate_hz': 3}" in output
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("bag", "record", "-o", "{}/bag"),
+        ("bag", "control", "pause"),
+        ("car", "topic", "echo", "/arm"),
+        ("car", "top"),
+        ("car", "page"),
+        ("attack", "cancel"),
+    ],
+)
+def test_no_command_waits_for_a_launch_that_has_ended(tmp_path, command, words):
+    (tmp_path / "launch.resolved.yaml").write_text("nodes: {camera: {module: nodes.camera}}\n")
+    words = [word.format(tmp_path) for word in words]
+    code, _, errors = command(*words, "--folder", tmp_path)
+    assert (code, "but all of its nodes have ended; start it" in errors) == (2, True)
+    assert not (tmp_path / "bag").exists()
+
+
+def test_a_recording_without_messages_is_no_success(tmp_path, command, monkeypatch):
+    def run(build, name, run_dir):
+        build(NodeContext(name, run_dir, SystemClock(), lambda _: 0)).close()
+        return 0
+
+    monkeypatch.setattr("nodes.runtime.process.run_node", run)
+    code, _, errors = command("bag", "record", "-o", tmp_path / "bag", "--folder", tmp_path)
+    assert (code, "recorded 0 messages in" in errors) == (1, True)
+
+
+def test_a_bag_that_cannot_be_played_leaves_no_folder(tmp_path, command):
+    with BagWriter(tmp_path / "bag"):
+        pass
+    assert command("bag", "play", tmp_path / "bag", "--folder", tmp_path / "new")[0] == 2
+    assert not (tmp_path / "new").exists()
 
 
 def test_launch_check_asks_the_nodes_about_their_configuration(folder):
