@@ -25,7 +25,8 @@ _EVENTS: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DEEPEST = 100
 # Aliases repeat content. A file of 1 kB can expand to a billion values.
 _MOST_REPEATED = 100_000
-_MOST_PROBLEMS = 20
+_MOST_PROBLEMS, _MOST_ALIKE = 20, 3
+_VARYING = re.compile(r"\S*\d\S*")
 _TAG = "tag:yaml.org,2002:"
 _WORDS = {"": None, "~": None} | {
     form: value
@@ -77,12 +78,22 @@ class Document:
         return Document({} if data is None else data, self.source, places)
 
 
+def one_a_line(problems: Sequence[str]) -> str:
+    """Text with a line for each problem. Those that differ only in words with digits, as of many rows, are said once and counted."""
+    alike: dict[str, list[str]] = {}
+    for problem in problems:
+        alike.setdefault(_VARYING.sub("", problem), []).append(problem)
+    lines: list[str] = []
+    for each in alike.values():
+        lines += each if len(each) <= _MOST_ALIKE else [f"{each[0]}; and {len(each) - 1} more like it"]
+    more = len(lines) - _MOST_PROBLEMS
+    return "\n  ".join([*lines[:_MOST_PROBLEMS], *([f"and {more} more problems"] if more > 0 else [])])
+
+
 def raise_problems(problems: Sequence[str]) -> None:
     """Raise one `ConfigError` with a line for each problem; nothing without problems."""
     if problems:
-        more = len(problems) - _MOST_PROBLEMS
-        rest = [f"and {more} more problems"] if more > 0 else []
-        raise ConfigError("\n".join([*problems[:_MOST_PROBLEMS], *rest]))
+        raise ConfigError(one_a_line(problems))
 
 
 def read_text(path: Path) -> str:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from advnerf_core.documents import one_a_line
 from advnerf_core.errors import AdvnerfError
-
-_MOST_LINES = 20
 
 
 class DatasetError(AdvnerfError):
@@ -19,7 +18,5 @@ def raise_all(errors: Sequence[DatasetError], count: int, what: str) -> None:
         return
     if len(errors) == 1:
         raise errors[0]
-    lines = [str(error) for error in errors[:_MOST_LINES]]
-    if len(errors) > len(lines):
-        lines.append(f"and {len(errors) - len(lines)} more")
-    raise DatasetError("\n  ".join([f"{len(errors)} of {count} {what} cannot be used:", *lines]))
+    lines = one_a_line([str(error) for error in errors])
+    raise DatasetError(f"{len(errors)} of {count} {what} cannot be used:\n  {lines}")

@@ -166,8 +166,9 @@ def fail_unless(met: bool) -> None:
 
 
 def say_error(text: str) -> None:
-    """Print an error as one line."""
-    print(f"error: {' '.join(text.split())}", file=sys.stderr, flush=True)
+    """Print an error as one line, or as one for each of its problems, which are in lines that are indented by two spaces."""
+    lines = [" ".join(line.split()) for line in re.split(r"\n  (?=\S)", text)]
+    print("error:", "\n  ".join(lines), file=sys.stderr, flush=True)
 
 
 def print_findings(findings: Sequence[CheckFinding], what: str = "part") -> bool:

@@ -7,7 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from advnerf_core.csv_rows import read_csv
-from advnerf_core.documents import dump_yaml, parse_json, parse_yaml, read_json, read_text, read_yaml
+from advnerf_core.documents import (
+    dump_yaml,
+    parse_json,
+    parse_yaml,
+    raise_problems,
+    read_json,
+    read_text,
+    read_yaml,
+)
 from advnerf_core.errors import ConfigError
 
 BOM = b"\xef\xbb\xbf"
@@ -59,16 +67,27 @@ def test_a_value_is_that_of_the_core_schema(text, value):
 def test_every_mistake_of_a_yaml_text_has_its_line(text, lines):
     with pytest.raises(ConfigError) as caught:
         parse_yaml(text, "a.yaml")
-    found = str(caught.value).split("\n")
+    found = str(caught.value).split("\n  ")
     assert len(found) == len(lines)
     assert all(line.startswith(start) for line, start in zip(found, lines, strict=True)), found
 
 
 def test_many_mistakes_are_listed_and_the_rest_is_counted():
+    names = [chr(97 + i % 26) * (1 + i // 26) for i in range(50)]
     with pytest.raises(ConfigError) as caught:
-        parse_yaml("a: 1\n" * 50, "a.yaml")
-    lines = str(caught.value).split("\n")
-    assert (lines[0][:9], lines[19][:10], lines[20:]) == ("a.yaml:2:", "a.yaml:21:", ["and 29 more problems"])
+        parse_yaml("".join(f"{name}: 1\n{name}: 1\n" for name in names), "a.yaml")
+    lines = str(caught.value).split("\n  ")
+    assert (lines[0][:9], lines[19][:10], lines[20:]) == ("a.yaml:2:", "a.yaml:40:", ["and 30 more problems"])
+
+
+def test_a_mistake_in_many_rows_is_said_once_and_counted():
+    rows = [f"a.csv:{i}: steering: expected a number, got 'nan'; correct the row" for i in range(2, 98)]
+    with pytest.raises(ConfigError) as caught:
+        raise_problems([*rows, "a.csv:99: expected 3 fields, got 2"])
+    assert str(caught.value).split("\n  ") == [
+        f"{rows[0]}; and 95 more like it",
+        "a.csv:99: expected 3 fields, got 2",
+    ]
 
 
 def test_aliases_that_explode_are_refused_at_once():
@@ -122,7 +141,7 @@ def test_what_is_written_is_read_again(data):
         ('{"a": 1,\n "b": {"a": 2},\n "a": 3}', r"^a\.json:3: a is given twice; remove one of them$"),
         (
             '{"f": [{"k": 1,\n"k": 2}],\n"f": "f", "g": "f: {"}',
-            r"^a\.json:2: k is .*\na\.json:3: f is given twice",
+            r"^a\.json:2: k is .*\n  a\.json:3: f is given twice",
         ),
         ('{"\\u0061": 1, "a": 2}', "a is given twice"),
         ('{\n"a" 1}', r"^a\.json:2: expected valid JSON: .*column 5$"),

@@ -77,7 +77,7 @@ def test_whole_numbers_are_numbers_in_either_form():
 def test_all_problems_of_a_file_are_listed_with_their_lines():
     with pytest.raises(ConfigError) as caught:
         read("speed_mps: on\nhorizn: 3\ngains: {gain: .inf}\ninside:\n- horizon: 0\n- raw: 1\n")
-    assert [line.split(": ")[:2] for line in str(caught.value).split("\n")] == [
+    assert [line.split(": ")[:2] for line in str(caught.value).split("\n  ")] == [
         ["a.yaml:2", "unknown key horizn; valid keys here"], ["a.yaml:1", "speed_mps"], ["a.yaml:3", "gains.gain"],
         ["a.yaml:5", "inside.0.horizon"], ["a.yaml:6", "inside.1.raw"],
     ]  # fmt: skip

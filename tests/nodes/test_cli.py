@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from advnerf_core.documents import raise_problems
 from nodes.bags.reader import read_info
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
@@ -322,6 +323,11 @@ def test_mistake_is_one_line_without_a_traceback(folder, command, arguments, mes
     assert errors.startswith("error: ")
     assert errors.count("\n") == 1
     assert message.format(folder=folder) in errors
+
+
+def test_problems_are_printed_one_a_line(command, monkeypatch):
+    monkeypatch.setattr(cli, "app", lambda **_: raise_problems(["a.yaml:1: one", "a.yaml:2: two\nparts"]))
+    assert command("doctor")[2] == "error: a.yaml:1: one\n  a.yaml:2: two parts\n"
 
 
 def test_a_full_disk_is_told_with_the_way_out(monkeypatch, capsys):

@@ -348,7 +348,7 @@ def test_wrong_launch_file_is_one_error_with_file_and_line(probe, tmp_path, text
     ) as caught:
         load_launch(file)
     # A misspelt key may also be a missing one: each problem has its own line.
-    first, *others = str(caught.value).split("\n")
+    first, *others = str(caught.value).split("\n  ")
     assert re.search(message, first)
     assert all(re.match(rf"{file}:\d+: ", line) for line in others)
 
