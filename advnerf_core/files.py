@@ -12,12 +12,15 @@ from typing import Any, Literal
 
 from advnerf_core.places import PlaceError, require_utf8
 
+PART = ".part"
+"""End of the name of an output while it is written."""
+
 
 def write_atomically(path: Path, data: str | bytes) -> None:
     """Write a whole file or nothing: under a temporary name first, synced, then renamed over ``path``."""
     require_utf8(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
+    temporary = path.with_name(path.name + PART)
     try:
         with temporary.open("wb") as stream:
             stream.write(data.encode() if isinstance(data, str) else data)
@@ -59,6 +62,12 @@ def refuse_overwriting(inputs: Iterable[Path | None], outputs: Iterable[Path]) -
 def write_json(path: Path, data: Any) -> None:
     """Write an indented JSON value, whole or not at all."""
     write_atomically(path, json.dumps(data, indent=1) + "\n")
+
+
+def not_writable(path: str | os.PathLike[str], error: OSError) -> str:
+    """Text of an error about an output that cannot be made."""
+    why = error.strerror or str(error)
+    return f"expected a folder that can be written to, got {os.fsdecode(path).removesuffix(PART)} ({why}); give another with -o or --folder"
 
 
 def sha256_of(file: Path) -> str:

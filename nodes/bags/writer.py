@@ -11,6 +11,7 @@ time to time, and another thread finishes the old one.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import queue
 import shutil
@@ -19,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from advnerf_core.files import write_atomically
+from advnerf_core.files import not_writable, write_atomically
 from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME
 from nodes.bags.metadata import Contents, rosbag2_metadata
 from nodes.bags.part import PartWriter
@@ -89,9 +90,9 @@ class BagWriter:
             )
         except OSError as error:
             shutil.rmtree(self.folder, ignore_errors=True)
-            raise BagError(
-                f"cannot record to {self.folder}: {error.strerror}; it needs {RESERVE_BYTES // 2**20} MiB of free space to begin"
-            ) from error
+            need = f"cannot record to {self.folder}: {error.strerror}; it needs {RESERVE_BYTES // 2**20} MiB of free space to begin"
+            is_full = error.errno == errno.ENOSPC
+            raise BagError(need if is_full else not_writable(self.folder, error)) from error
         self._open = True
         self._full: queue.Queue[PartWriter | None] = queue.Queue()
         self._finishing = False

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
 import shlex
+import traceback
 from collections.abc import Sequence
 from typing import Any
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import PART, not_writable
 
 INTERRUPTED, TERMINATED = 130, 143
 # Commands that continue where they were stopped when they are given again. ``scene from-...`` say so themselves, with the folder.
@@ -31,6 +34,8 @@ _IN_THE_WAY = {
     NotADirectoryError: "folders on the way to {}, got a file",
     IsADirectoryError: "a file at {}, or nothing, got a folder",
 }
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_SHORT = re.compile(r"\d+ requested and \d+ written")  # what NumPy says of a full disk, without a number
 
 
 def is_resumable(words: Sequence[str]) -> bool:
@@ -76,13 +81,24 @@ def _with_value(error: Exception, text: str) -> str:
 
 def text_for_people(error: Exception) -> str | None:
     """Text of an error that the user can fix; None if the exception is a bug, which keeps its traceback."""
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+    if isinstance(error, OSError) and (error.errno in _FULL or _SHORT.fullmatch(str(error))):
         where = f" of {error.filename}" if error.filename else ""
         return f"the disk{where} is full: free some space or choose another folder. Finished work is kept"
     if isinstance(error, OSError) and not isinstance(error, AdvnerfError) and error.filename:
+        if _is_unwritable(error):
+            return not_writable(error.filename, error)
         for kind, wanted in _IN_THE_WAY.items():
             if isinstance(error, kind):
                 return f"expected {wanted.format(error.filename)}; choose another name"
     if isinstance(error, AdvnerfError | OSError):
         return str(error) or type(error).__name__
     return None
+
+
+def _is_unwritable(error: OSError) -> bool:
+    """Whether a file or folder could not be made. An input that cannot be read, which may have the same number, is there."""
+    making = [frame.name for frame in traceback.extract_tb(error.__traceback__)][-1:]
+    if making in (["mkdir"], ["makedirs"]) or os.fsdecode(error.filename).endswith(PART):
+        return not isinstance(error, FileExistsError | NotADirectoryError)
+    is_denied = error.errno in (errno.EACCES, errno.EPERM) and not os.path.isfile(error.filename)
+    return error.errno == errno.EROFS or is_denied

@@ -1,3 +1,4 @@
+import errno
 import os
 import re
 import signal
@@ -11,12 +12,14 @@ import numpy as np
 import pytest
 
 from advnerf_core.documents import raise_problems
+from advnerf_core.files import write_atomically
 from nodes.bags.reader import read_info
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
 from nodes.cli.endings import text_for_people
 from nodes.launching.watching import describe
 from nodes.runtime.clock import SystemClock
+from nodes.runtime.errors import BagError
 from nodes.runtime.messages import encode, pose_message
 from nodes.runtime.node import NodeContext
 from tests.support.waiting import wait_for
@@ -338,6 +341,55 @@ def test_a_full_disk_is_told_with_the_way_out(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith(
         "error: the disk is full: free some space or choose another folder"
     )
+
+
+def test_a_short_write_of_numpy_is_a_full_disk(tmp_path):
+    code = """
+        import resource, sys
+        import numpy as np
+        from nodes.cli.endings import text_for_people
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+        try:
+            np.save(sys.argv[1], np.zeros(4096))
+        except OSError as error:
+            print(text_for_people(error))
+    """
+    program = [sys.executable, "-c", textwrap.dedent(code), str(tmp_path / "a.npy")]
+    done = subprocess.run(program, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("the disk is full: free some space")
+
+
+def read_only(path):
+    raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+
+@pytest.mark.parametrize(
+    ("make", "path"),
+    [
+        (lambda path: path.mkdir(parents=True), "/proc/nothing"),
+        (lambda path: write_atomically(path, "text"), "/proc/nothing"),
+        (read_only, "/mnt/a"),
+        (lambda path: read_only(f"{path}.part"), "/mnt/a"),
+    ],
+)
+def test_an_output_that_cannot_be_made_is_told_with_its_option(make, path):
+    with pytest.raises(OSError) as error:
+        make(Path(path))
+    told = text_for_people(error.value)
+    assert told.startswith(f"expected a folder that can be written to, got {path} (")
+    assert told.endswith("; give another with -o or --folder")
+
+
+def test_an_input_that_is_missing_is_no_output(tmp_path):
+    with pytest.raises(OSError) as error:
+        (tmp_path / "nothing").read_bytes()
+    assert "written to" not in text_for_people(error.value)
+
+
+def test_a_bag_on_a_read_only_disk_needs_no_space(tmp_path, monkeypatch):
+    monkeypatch.setattr(BagWriter, "_hold_reserve", lambda writer: read_only(writer.folder))
+    with pytest.raises(BagError, match=r"written to, got .*/bag \(Read-only file system\); give another"):
+        BagWriter(tmp_path / "bag")
 
 
 def test_mistake_in_an_option_is_told_by_the_option(command, tmp_path):
