@@ -43,12 +43,15 @@ class CsvRow:
         return value
 
 
-def read_csv(path: Path, columns: Sequence[str] = (), bare: Sequence[str] = ()) -> list[CsvRow]:
+def read_csv(
+    path: Path, columns: Sequence[str] = (), bare: Sequence[str] = (), cure: str = "correct the header"
+) -> list[CsvRow]:
     """Rows of a CSV file whose header has some columns. Rows whose length differs from the header's are refused.
 
     Args:
         columns: Columns that the header must have.
         bare: Columns of a file without a header: one whose first row has this length, and a number in the last field.
+        cure: What to do about a header without these columns.
     """
     reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     rows: list[CsvRow] = []
@@ -59,7 +62,7 @@ def read_csv(path: Path, columns: Sequence[str] = (), bare: Sequence[str] = ()) 
         is_bare = bool(bare) and len(first) == len(bare) and is_real(first[-1].strip())
         names = list(bare) if is_bare else [name.strip() for name in first]
         _require_commas(path, names, columns)
-        problems += _header_problems(path, names, columns)
+        problems += _header_problems(path, names, columns, cure)
         began = reader.line_num + 1
         for values in itertools.chain([first] if is_bare else [], reader):
             place = f"{path}:{reader.line_num}"
@@ -88,12 +91,12 @@ def _require_commas(path: Path, names: Sequence[str], columns: Sequence[str]) ->
         )
 
 
-def _header_problems(path: Path, names: list[str], columns: Sequence[str]) -> list[str]:
+def _header_problems(path: Path, names: list[str], columns: Sequence[str], cure: str) -> list[str]:
     problems = [
         f"{path}:1: the column {name} is given twice; rename or remove one of them"
         for name in sorted({name for name in names if name and names.count(name) > 1})
     ]
     if any(column not in names for column in columns):
         got = ", ".join(names) or "an empty file"
-        problems.append(f"{path}:1: expected columns {', '.join(columns)}, got {got}; correct the header")
+        problems.append(f"{path}:1: expected columns {', '.join(columns)}, got {got}; {cure}")
     return problems

@@ -46,7 +46,9 @@ def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
     is_udacity = any(set(_UDACITY[:4]) <= set(row.values) for row in first)
     images = choice.images or ("center" if is_udacity else "image")
     name = choice.steering or "steering"
-    rows = read_csv(path, (images, name), bare=_UDACITY)
+    rows = read_csv(
+        path, (images, name), _UDACITY, "name yours with --images and --steering, or correct the header"
+    )
     if is_udacity and images in ("left", "right") and choice.steering_offset_rad is None:
         raise LogError(
             f"{path}: the recorded steering belongs to the center camera; for images={images} give what its driver would "

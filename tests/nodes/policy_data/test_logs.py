@@ -503,6 +503,15 @@ def test_times_of_a_slow_clock_are_said(tmp_path, monkeypatch, capsys):
     assert "the log has times that go back or repeat" in capsys.readouterr().out
 
 
+def test_columns_of_other_names_are_answered_with_the_options_that_name_them(tmp_path):
+    file = write_timed(tmp_path / "log", "time", FORWARD)
+    file.write_text(file.read_text().replace("image,steering", "Image,steering_deg"))
+    said = "expected columns image, steering, got Image, steering_deg, time; name yours with --images and --steering"
+    with pytest.raises(ConfigError, match=said):
+        open_log(file)
+    assert open_log(file, LogChoice(images="Image", steering="steering_deg")).count == len(FORWARD)
+
+
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared logs are not here")
 def test_the_tub_of_donkeycar_s_tests_is_read_and_a_bag_without_images_refused():
     log = open_log(SHARED / "donkey_tub", LogChoice(steering_full_rad=0.3))

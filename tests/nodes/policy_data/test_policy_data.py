@@ -101,7 +101,7 @@ def test_images_of_another_size_are_seen_through_the_policy_s_own_window(tmp_pat
     [
         (
             lambda t: t.replace("angle", "wheel"),
-            "csv:1: expected columns frame, angle, got frame, wheel; correct the header",
+            "csv:1: expected columns frame, angle, got frame, wheel; name yours with --images and --steering",
         ),
         (
             lambda t: t.replace("3.png", "no.png"),
