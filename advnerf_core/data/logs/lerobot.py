@@ -38,6 +38,7 @@ _BATCH = 64
 # Episodes have no times of their own: a pause between them keeps them apart.
 _PAUSE_S = 10.0
 _RATE_TOLERANCE = 0.1
+_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 _LARGEST = 2**53
 # Exceptions that PyArrow raises for a damaged file beside its own.
 _NONSENSE = (OSError, ValueError, KeyError, IndexError, TypeError, OverflowError, MemoryError)
@@ -224,10 +225,19 @@ def _require_consistent(data: _DataSet, table: dict[str, NDArray[np.float64]]) -
             "copy the data set again"
         )
     rate_hz = 1.0 / float(np.median(steps_s)) if len(steps_s) else data.fps
-    if abs(rate_hz / data.fps - 1.0) > _RATE_TOLERANCE:
+    for unit, per_s in _UNITS.items():
+        if _is_about(per_s * rate_hz, data.fps):
+            raise LogError(
+                f"{data.path}: timestamp: expected seconds, got what looks like {unit}, as fps is {data.fps:g}; divide the column by {per_s:g}"
+            )
+    if not _is_about(rate_hz, data.fps):
         raise LogError(
             f"{data.path / INFO}: fps: expected {rate_hz:.4g}, as the column timestamp of the tables has, got {data.fps:g}; correct it"
         )
+
+
+def _is_about(rate_hz: float, expected_hz: float) -> bool:
+    return abs(rate_hz / expected_hz - 1.0) <= _RATE_TOLERANCE
 
 
 def _stamps(data: _DataSet, episodes: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -218,6 +218,20 @@ DAMAGED = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize(("unit", "per_s"), [("milliseconds", 1000), ("microseconds", 1000000)])
+def test_a_lerobot_data_set_in_another_unit_of_time_is_not_blamed_on_its_rate(tmp_path, unit, per_s):
+    folder = write_lerobot_3(tmp_path / "log")
+
+    def scaled(rows):
+        values = [per_s * each for each in rows["timestamp"].to_pylist()]
+        return rows.set_column(rows.column_names.index("timestamp"), "timestamp", [values])
+
+    change_table(folder, scaled)
+    said = rf"timestamp: expected seconds, got what looks like {unit}, as fps is 10; divide the column by"
+    with pytest.raises(LogError, match=said):
+        open_log(folder)
+
+
 @pytest.mark.parametrize("case", DAMAGED)
 def test_what_is_damaged_is_one_line(tmp_path, case):
     form, damage, said = DAMAGED[case]
