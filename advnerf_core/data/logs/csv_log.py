@@ -56,15 +56,17 @@ def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
         )
     unit = SteeringUnit(name, _FULL_RAD, "right") if is_udacity else SteeringUnit(name)
     unit = unit.chosen(choice)
-    values, problems = [], []
+    values, problems, steep = [], [], []
     for row in rows:
         try:
             values.append(row.number(name))
             if not unit.unknown:
                 unit.wheel_rad(values[-1], row.place)
-        except (ConfigError, LogError) as error:
+        except ConfigError as error:
             problems.append(str(error))
-    raise_problems(problems)
+        except LogError as error:
+            steep.append(str(error))
+    raise_problems([*problems, *steep[:1]])  # one setting is the cure of all steep angles
     files = [_image_file(row, path.parent, images) for row in rows]
     refuse_repeated_images(zip((row.place for row in rows), files, strict=True))
 

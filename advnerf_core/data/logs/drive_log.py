@@ -72,9 +72,14 @@ class SteeringUnit:
             )
         angle_rad = value * self.full_rad * (1.0 if self.positive == "left" else -1.0) + self.offset_rad
         if abs(angle_rad) >= _STEEPEST_RAD:
+            is_degrees = self.full_rad == 1.0 and abs(math.radians(value)) < _STEEPEST_RAD
             raise LogError(
                 f"{place}: expected a steering angle below {_STEEPEST_RAD:g} rad, got {value:g} times {self.full_rad:g}; "
-                "give the wheel angle at a value of 1 with --steering-full-rad"
+                + (
+                    "these look like degrees: give --steering-full-rad 0.01745"
+                    if is_degrees
+                    else "give the wheel angle at a value of 1 with --steering-full-rad"
+                )
             )
         return angle_rad
 

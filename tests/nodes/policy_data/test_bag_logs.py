@@ -15,7 +15,7 @@ from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.view import PolicyView
 from nodes.bags.writer import BagWriter
-from nodes.lab.policy_data.frames import frames_of
+from nodes.lab.policy_data.frames import frames_of, view_for_size
 from nodes.lab.policy_data.log_facts import read_facts
 from nodes.lab.policy_data.logs import open_log
 from nodes.runtime.messages import encode, header, image_message, pose_message, types
@@ -251,8 +251,12 @@ def test_an_image_with_the_stamp_of_another_is_refused(tmp_path, repeated, first
     [
         ({"late_ns": 60 * 10**9}, "no steering belongs to any of the first 20 images: their times differ"),
         (
+            {"step": 20.0},
+            "/drive: expected a steering angle below 1 rad, got 380 times 1; give the wheel angle at a value of 1 with --steering-full-rad",
+        ),
+        (
             {"step": 1.0},
-            "/drive: expected a steering angle below 1 rad, got 19 times 1; give the wheel angle at a value of 1 with --steering-full-rad",
+            "/drive: expected a steering angle below 1 rad, got 19 times 1; these look like degrees: give --steering-full-rad 0.01745",
         ),
     ],
 )
@@ -294,6 +298,14 @@ def test_steering_of_another_type_is_named_with_the_type_that_is_read(tmp_path, 
     ):
         with pytest.raises(LogError, match=re.escape(said)):
             refused()
+
+
+def test_the_setting_for_degrees_gives_the_angle_in_radians(tmp_path):
+    degrees = open_log(
+        write_ackermann(tmp_path / "drive", "ros2", step=1.0), LogChoice(steering_full_rad=0.01745)
+    )
+    found = frames_of(degrees, view_for_size(336, 188), None, "recorded").recorded_rad
+    assert found == pytest.approx(np.deg2rad(range(6)), rel=1e-3)
 
 
 def test_of_two_topics_with_commands_none_is_taken_unasked(tmp_path):

@@ -526,6 +526,18 @@ def test_columns_of_other_names_are_answered_with_the_options_that_name_them(tmp
     assert open_log(file, LogChoice(images="Image", steering="steering_deg")).count == len(FORWARD)
 
 
+def test_a_csv_file_in_degrees_is_one_line_with_the_setting_for_it(tmp_path):
+    file = write_timed(tmp_path / "log", "time", FORWARD)
+    file.write_text(
+        re.sub(r"png,([-.0-9]+)", lambda found: f"png,{30 * float(found[1]) + 20}", file.read_text())
+    )
+    unit = LogChoice(steering_full_rad=1.0, steering_positive="left")
+    with pytest.raises(
+        AdvnerfError, match=r"got 2 times 1; these look like degrees: give --steering-full-rad 0\.01745$"
+    ):
+        open_log(file, unit)
+
+
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared logs are not here")
 def test_the_tub_of_donkeycar_s_tests_is_read_and_a_bag_without_images_refused():
     log = open_log(SHARED / "donkey_tub", LogChoice(steering_full_rad=0.3))
