@@ -58,7 +58,10 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     assert everywhere.count("[paper_car]") == 2
     # A claim about places is told too, with the places where nothing was found.
     (transfers,) = [each.text for each in answers([], published) if each.question == "Does it transfer?"]
-    assert "to the strongest baseline, per tick and in drives off the track: metadrive_billboard +0.487 m (95 % " in transfers
+    assert (
+        "to the strongest baseline, per tick and in drives off the track: metadrive_billboard +0.487 m (95 % "
+        in transfers
+    )
     assert "+22 points (4 places and 2 victims); " in transfers
     # Nothing is claimed that was not measured.
     assert "How fast?" not in found
