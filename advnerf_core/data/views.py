@@ -190,7 +190,7 @@ class PosedImages:
         sizes = {(view.pinhole.width, view.pinhole.height) for view in views}
         if len(sizes) > 1:
             raise DatasetError(
-                f"expected images of one size in {self._name}, got {sorted(sizes)}; give a size to bring them to"
+                f"expected images of one size in {self._name}, got {sorted(sizes)}; give --size WIDTH HEIGHT to bring them to one"
             )
         shape = views[0].rgb.shape[:2]
         opaque, whole = np.full(shape, OPAQUE, np.uint8), np.ones(shape, np.bool_)

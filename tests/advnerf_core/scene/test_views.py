@@ -126,7 +126,7 @@ def test_images_of_several_sizes_need_a_common_one(tmp_path):
     save(tmp_path / "0.png", np.zeros((30, 40, 3), np.uint8))
     save(tmp_path / "1.png", np.zeros((60, 80, 3), np.uint8))
     listed = load_transforms(write(tmp_path, count=2))
-    with pytest.raises(DatasetError, match=r"one size in .*transforms\.json, got .*give a size"):
+    with pytest.raises(DatasetError, match=r"one size in .*transforms\.json, got .*give --size WIDTH HEIGHT"):
         listed.load()
     assert listed.load(size=(20, 15)).rgb.shape == (2, 15, 20, 3)
 
