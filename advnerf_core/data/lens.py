@@ -23,6 +23,7 @@ WIDEST_HALF_ANGLE_RAD = math.radians(70.0)
 _EDGE_SAMPLES = 64
 # OpenCV's maps end at 2^15; the largest sensors of phones have 200 million pixels.
 LONGEST_PX, _MOST_PIXELS = 2**15 - 2, 2**28
+_WIDEST_RAD = math.radians(130.0)  # no lens that is no fisheye has such a view
 
 
 @dataclass(frozen=True)
@@ -185,6 +186,12 @@ def _opencv_matrix(pinhole: Pinhole) -> Array:
 
 
 def _cannot_be_undone(pinhole: Pinhole, lens: Lens) -> DatasetError:
+    view = 2.0 * math.atan(0.5 * max(pinhole.width / pinhole.fx, pinhole.height / pinhole.fy))
+    if not lens.fisheye and view > _WIDEST_RAD:
+        return DatasetError(
+            f"expected a focal length that fits the images, got a view of {math.degrees(view):.0f} degrees (fl_x {pinhole.fx:.1f} at "
+            f"{pinhole.width} x {pinhole.height} px); correct w and h, or fl_x and fl_y: they must be of one size of the images"
+        )
     kind = "OPENCV_FISHEYE k1, k2, k3, k4" if lens.fisheye else "OPENCV k1, k2, p1, p2, k3"
     return DatasetError(
         f"expected a distortion that can be undone over the whole image, got {kind} = "

@@ -158,11 +158,8 @@ def lens_of(pinhole: Pinhole, lens: Lens, where: str) -> Lens:
     """
     try:
         straightening(pinhole, lens)
-    except DatasetError:
-        raise ScanError(
-            f"{where}: expected a distortion that can be undone, got {', '.join(f'{each:.4g}' for each in lens.coefficients)}; "
-            "correct the calibration, or undistort the images first"
-        ) from None
+    except DatasetError as error:
+        raise ScanError(f"{where}: {error}") from None
     return lens
 
 

@@ -101,6 +101,10 @@ def test_an_image_that_opencv_cannot_map_is_refused(size):
 def test_coefficients_that_fold_the_image_are_refused():
     with pytest.raises(DatasetError, match=r"distortion that can be undone.*k1, k2.*= -3, 0"):
         straightening(PINHOLE, Lens((-3.0, 0.0, 0.0, 0.0, 0.0)))
+    with pytest.raises(
+        DatasetError, match=r"focal length that fits .* 164 degrees .*correct w and h, or fl_x"
+    ):
+        straightening(Pinhole(108, 192, 13.8, 13.8, 5.4, 9.6), Lens((0.058, -0.08, 0.0, 0.0, 0.0)))
     with pytest.raises(ValueError, match="4 finite distortion coefficients"):
         Lens((0.1, 0.2), fisheye=True)
 
