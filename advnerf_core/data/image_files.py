@@ -95,10 +95,15 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height [px] that `read_stored` would return; for a PNG without decoding it."""
     with _open(path) as stream:
         head = stream.read(24)
-    if head.startswith(PNG) and len(head) == 24:
-        width, height = struct.unpack(">II", head[16:24])
+    return size_of(head if head.startswith(PNG) else read_bytes(path), str(path))
+
+
+def size_of(data: bytes, source: str) -> tuple[int, int]:
+    """The same of the content of an image file; errors call it ``source``."""
+    if data.startswith(PNG) and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
         return int(width), int(height)
-    rgb, _ = read_stored(path)
+    rgb = decode_stored(data, source)
     return rgb.shape[1], rgb.shape[0]
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.image_files import SUFFIXES, image_size, read_bytes, write_image
+from advnerf_core.data.image_files import SUFFIXES, read_bytes, size_of, write_image
 from advnerf_core.data.similarity import extent
 from advnerf_core.data.view_loading import read_valid
 from advnerf_core.files import write_atomically
@@ -128,9 +128,10 @@ def _copied(image: Registered, picture: Picture, folder: Path) -> Registered:
     """
     name = f"{IMAGES}/{picture.name}"
     copy = folder / name
-    write_atomically(copy, picture.content())
+    content = picture.content()
+    size = size_of(content, image.name)
+    write_atomically(copy, content)
     try:
-        size = image_size(copy)
         pinhole = _same_size(image, picture, size)
         if picture.edited is not None:
             pixels, pinhole = picture.edited()

@@ -409,6 +409,14 @@ def test_an_image_that_is_damaged_is_left_out(tmp_path):
     assert "Bad CRC-32" in report["model"]["left_out"][0]["why"]
 
 
+def test_a_damaged_image_is_named_as_in_the_scan(tmp_path):
+    scan = scan_samples.nerfstudio(tmp_path / "scan")
+    file = sorted((scan / "images").iterdir())[3]
+    file.write_bytes(file.read_bytes()[:20])
+    (left_out,) = run(tmp_path, scan)[1]["model"]["left_out"]
+    assert f"got {left_out['name']} (20 bytes)" in left_out["why"]
+
+
 def test_silhouettes_leave_the_box_to_training(tmp_path):
     scan = scan_samples.nerfstudio(tmp_path / "scan")
     (scan / "sparse_pc.ply").unlink()
