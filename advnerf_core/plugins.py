@@ -26,7 +26,7 @@ from pydantic import BaseModel, ValidationError
 from advnerf_core.code_files import entry_point_sha256, file_sha256, modules_beside
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.places import expanded
-from advnerf_core.strict import strict_validator
+from advnerf_core.strict import strict_validator, what_is_wrong
 
 T = TypeVar("T")
 # What a user's code raises when it fails; a call of sys.exit would end the command as if all were well.
@@ -283,9 +283,7 @@ def options_of(
         return strict_validator(model).validate_python(dict(written))
     except ValidationError as problem:
         first = problem.errors(include_url=False)[0]
-        place = ".".join(map(str, (key, *first["loc"])))
-        message = str(first["msg"]).removeprefix("Value error, ")
-        raise error(f"{place}: {message[:1].lower()}{message[1:]}, got {first['input']!r:.80}") from None
+        raise error(what_is_wrong(model, (key, *first["loc"]), first)) from None
 
 
 def _fields_of(model: type[Any] | None) -> tuple[str, ...]:

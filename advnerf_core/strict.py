@@ -273,12 +273,13 @@ def _explain(model: Any, document: Document, error: ValidationError) -> list[str
     for problem in problems:
         key = _as_written(document.data, tuple(problem["loc"]))
         # A value with several possible types fails as each of them.
-        lines.setdefault(key, f"{document.place(key)}: {_what(model, key, problem)}")
+        lines.setdefault(key, f"{document.place(key)}: {what_is_wrong(model, key, problem)}")
     # A list with a wrong item is too short as well, and a section is no word.
     return [line for key, line in lines.items() if not any(key == each[: len(key)] != each for each in lines)]
 
 
-def _what(model: Any, key: Key, problem: Any) -> str:
+def what_is_wrong(model: Any, key: Key, problem: Any) -> str:
+    """One of pydantic's errors in our words; ``key`` is where the user wrote it."""
     name = ".".join(map(str, key)) or "the whole"
     if problem["type"] == "extra_forbidden":
         valid = ", ".join(_valid_keys(model, tuple(problem["loc"])[:-1])) or "none"
@@ -291,7 +292,9 @@ def _what(model: Any, key: Key, problem: Any) -> str:
         tag = str(problem["ctx"]["discriminator"]).strip("'")
         return f"{name}.{tag} is missing; add it" if key else f"{tag} is missing; add it"
     if problem["type"] in _NOT_OF_YAML:
-        return f"{name}: expected {_NOT_OF_YAML[problem['type']]}, got {problem['input']!r:.80}"
+        is_item = problem["type"] in ("tuple_type", "list_type") and isinstance(problem["input"], int | float)
+        advice = f"; write [{problem['input']}]" if is_item else ""
+        return f"{name}: expected {_NOT_OF_YAML[problem['type']]}, got {problem['input']!r:.80}{advice}"
     if problem["type"] == "union_tag_invalid":
         context = problem["ctx"]
         return f"{name}: expected {context['discriminator']} to be one of {context['expected_tags']}, got {context['tag']!r}"

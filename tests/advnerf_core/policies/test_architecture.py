@@ -266,6 +266,7 @@ def test_a_description_is_the_same_wherever_the_file_is(dropping: str, tmp_path)
         ),
         ("resnet", {"blocks": 0}, "configuration.blocks: input should be greater than or equal to 1, got 0"),
         ("resnet", {"hidden": "64"}, "configuration.hidden: input should be a valid integer, got '64'"),
+        ("vit_tiny", {"patch": 7}, r"configuration.patch: expected a list in brackets, got 7; write \[7\]"),
         ("vit_tiny", {"patch": [7, 10]}, "whose height divides 66"),
         ("vit_tiny", {"width": 30}, "multiple of 4 and of heads"),
         ("nowhere.py:Net", {}, "expected a Python file at .*nowhere.py"),
