@@ -11,7 +11,7 @@ from typing import Literal, get_args
 from advnerf_core.errors import AdvnerfError
 
 Side = Literal["left", "right"]
-_SETTINGS = re.compile(r"(?P<path>.+?),(?P<settings>\s*[a-z_-]+\s*=.*)")
+_SETTING = re.compile(r"(?<=.),(?=\s*[a-z_-]+\s*=)")
 
 
 class LogError(AdvnerfError, ValueError):
@@ -87,8 +87,10 @@ class LogRequest:
         Raises:
             LogError: The path does not exist, or a setting is unknown.
         """
-        found = None if Path(text).exists() else _SETTINGS.fullmatch(text)
-        request = cls(Path(text)) if found is None else cls(Path(found["path"]), found["settings"])
+        ends = [len(text), *(found.start() for found in reversed(list(_SETTING.finditer(text))))]
+        # A comma may be part of a name: the longest path that exists counts.
+        end = next((each for each in ends if Path(text[:each]).exists()), ends[-1])
+        request = cls(Path(text[:end]), text[end + 1 :])
         if not request.path.exists():
             raise LogError(f"expected a log at {request.path}, found none; correct the path")
         request.choice(LogChoice())

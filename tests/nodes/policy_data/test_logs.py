@@ -147,6 +147,15 @@ def test_which_number_of_a_lerobot_data_set_is_the_steering_is_not_guessed(tmp_p
     assert radians.unit.unknown == "--steering-positive"
 
 
+def test_a_comma_in_a_folders_name_is_no_setting(tmp_path):
+    file = tmp_path / "odd,a=b" / "ok.csv"
+    file.parent.mkdir()
+    file.touch()
+    (tmp_path / "odd").mkdir()
+    for settings in ("", "steering-positive=left", "images=a,steering=b"):
+        assert LogRequest.parsed(f"{file},{settings}".rstrip(",")) == LogRequest(file, settings)
+
+
 def test_a_misspelt_steering_of_a_tub_is_answered_with_its_names(tmp_path):
     folder = write_tub_2(tmp_path / "log")
     with pytest.raises(
