@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
@@ -48,14 +51,23 @@ def hold(path: Path) -> TextIO:
     return lock
 
 
-def hold_folder(folder: Path) -> TextIO:
-    """Make a folder and take its lock.
+@contextlib.contextmanager
+def hold_folder(folder: Path) -> Iterator[None]:
+    """Make a folder and hold its lock. A new folder in which an error has left nothing else is removed.
 
     Raises:
         ConfigError: Another process works in it.
     """
+    is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        return hold(folder / ".lock")
+        lock = hold(folder / ".lock")
     except HeldError as error:
         raise ConfigError(f"{folder} is in use by process {error.owner}: wait for it, or stop it") from None
+    with lock:
+        try:
+            yield
+        except BaseException:
+            if is_new and os.listdir(folder) == [".lock"]:
+                shutil.rmtree(folder, ignore_errors=True)
+            raise

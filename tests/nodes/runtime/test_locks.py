@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from nodes.runtime.locks import HeldError, hold
+from nodes.runtime.locks import HeldError, hold, hold_folder
 
 STRANGER = 4242
 
@@ -16,6 +16,21 @@ def test_a_lock_names_its_owner_and_ends_with_its_file(tmp_path):
             hold(tmp_path / "lock")
         assert held.value.owner == str(os.getpid())
     hold(tmp_path / "lock").close()
+
+
+def fail_in(folder, is_used):
+    with hold_folder(folder):
+        if is_used:
+            (folder / "work").touch()
+        (folder / "input").read_bytes()
+
+
+def test_a_new_folder_with_nothing_but_its_lock_goes_with_the_error(tmp_path):
+    (tmp_path / "there").mkdir()
+    for name in ("there", "new", "used"):
+        with pytest.raises(FileNotFoundError):
+            fail_in(tmp_path / name, name == "used")
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["there", "used"]
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another user")
