@@ -28,9 +28,9 @@ from benchmarks.strongest import strongest_random
 
 # Worlds that this project did not write, or did not draw, by what the names of their sets contain.
 _FOREIGN = {
-    "metadrive": "in MetaDrive, with its own renderer and car",
-    "duckietown": "in Duckietown, with its own renderer and robot",
-    "filament": "in the lab's room as MuJoCo 4's renderer Filament draws it",
+    "metadrive": "in MetaDrive, with its renderer and car",
+    "duckietown": "in Duckietown, with its renderer and robot",
+    "filament": "in the room as Filament draws it",
 }
 _COLUMNS = (
     "registered set",
@@ -152,9 +152,9 @@ def _transfers(sets: Sequence[Mapping[str, Any]], about: Mapping[str, SetAbout])
     moved = sum(excess.is_shown for excess in smaller)
     lacking = sum(there["over_no_object_m"] is None for _, there in pairs)
     return (
-        f"{_counts(sets, about)} In {moved} of {len(pairs)} comparisons the deployed attack moves the car further from its path than the controls do "
+        f"{_counts(sets, about)} In {moved} of {len(pairs)} comparisons the deployed attack moves the car further from its path than controls "
         f"(95 % interval above zero), by {min(each.mean_m for each in smaller):.3f} to {max(each.mean_m for each in smaller):.3f} m per tick over the "
-        f"control that leaves less; {lacking} have no drives with no object. Of this excess in the learned scene, {100 * min(kept):.0f} to "
+        f"stronger control; {lacking} have no drives with no object. Of this excess in the learned scene, {100 * min(kept):.0f} to "
         f"{100 * max(kept):.0f} % is left.{_claimed(sets)}"
     )
 
@@ -218,9 +218,9 @@ def _victims(sets: Sequence[Mapping[str, Any]], published: Path) -> str:
     place = next(name for name, each in named if each is off)
     whom = "them" if len(titles) == 1 else "those trained with textures"
     return (
-        f"{len(titles)} victim{'s' * (len(titles) > 1)}, as their sets name them. The best random search of each set moves {whom} {min(each.deployed.best_m for each in found):.3f} to "
-        f"{worst.deployed.best_m:.3f} m per tick where it is deployed (set {place}: {off.deployed.off_track} of {off.deployed.drives} drives off the track, "
-        f"{off.deployed.all_off_track} of {off.deployed.all_drives} of all {off.searches} searches), and up to "
+        f"{len(titles)} victim{'s' * (len(titles) > 1)}. The best random search of each set moves {whom} {min(each.deployed.best_m for each in found):.3f} to "
+        f"{worst.deployed.best_m:.3f} m per tick, deployed (set {place}: {off.deployed.off_track} of {off.deployed.drives} drives off the track, "
+        f"{off.deployed.all_off_track} of {off.deployed.all_drives} of all searches), and up to "
         f"{max(each.surrogate.best_m for each in found):.3f} m in the learned scene."
     )
 
@@ -231,8 +231,8 @@ def _realistic(rows: Sequence[Mapping[str, Any]]) -> str:
     if picture is None or steering is None:
         return ""
     return (
-        f"Held-out views of the room: {picture:.1f} dB PSNR at the policy's size. On them the policy steers {steering:.3f} rad differently, "
-        "in the mean. Real photographs are in [learned places](results/learned_places.md)."
+        f"Held-out views of the room: {picture:.1f} dB PSNR at the policy's size. There the policy steers {steering:.3f} rad differently, "
+        "in the mean. [Real photographs](results/learned_places.md)."
     )
 
 
@@ -244,10 +244,8 @@ def _worlds(sets: Sequence[Mapping[str, Any]]) -> str:
     driven = " and ".join(words.get(each, each) for each in through)
     names = [str(found["name"]) for found in sets]
     foreign = [each for key, each in _FOREIGN.items() if any(key in name for name in names)]
-    elsewhere = (
-        f" Also {'; '.join(foreign[:-1])}{'; and ' if foreign[1:] else ''}{foreign[-1]}." if foreign else ""
-    )
-    return f"In this project's own simulated places, driven {driven}.{elsewhere} No real car was driven."
+    elsewhere = f" Also {'; '.join(foreign)}." if foreign else ""
+    return f"In simulated places, driven {driven}.{elsewhere} No real car was driven."
 
 
 def _fast(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -42,10 +42,8 @@ def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
     assert "1 registered sets, 1 groups of searches. In 1 of 1 comparisons" in found["Does it transfer?"]
     # The maximum over searches, from the kept drives: an attacker takes it.
     victims = found["Against which victims?"]
-    assert victims.startswith(
-        "1 victim, as their sets name them. The best random search of each set moves them 0.169 to 0.169 m"
-    )
-    assert "(set room: 5 of 5 drives off the track, 20 of 30 of all 6 searches), and up to 0.185 m" in victims
+    assert victims.startswith("1 victim. The best random search of each set moves them 0.169 to 0.169 m")
+    assert "(set room: 5 of 5 drives off the track, 20 of 30 of all searches), and up to 0.185 m" in victims
     (line,) = sets_table(tmp_path).splitlines()[2:]
     assert "| trained with textures |" in line
     assert "| +0.123 (random, coarse) | not tested |" in line
@@ -89,10 +87,7 @@ def test_an_answer_counts_groups_of_searches_and_uses_the_smaller_excess(tmp_pat
     (answer,) = [each.text for each in answers([], tmp_path) if each.question == "Does it transfer?"]
     assert "3 registered sets are 2 groups of searches in 2 worlds: 3 sets explore, 0 confirm." in answer
     # MetaDrive's 0.204 m over the plain panel are 0.067 m over no object.
-    assert (
-        "by 0.067 to 0.074 m per tick over the control that leaves less; 1 have no drives with no object"
-        in answer
-    )
+    assert "by 0.067 to 0.074 m per tick over the stronger control; 1 have no drives with no object" in answer
     file = tmp_path / "gap_metadrive" / "set" / "set.json"
     data = json.loads(file.read_text())
     for row in data["rows"]:
