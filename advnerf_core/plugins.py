@@ -312,17 +312,22 @@ def _load_entry_point(entry: EntryPoint, what: str) -> Any:
         ) from error
 
 
+def is_signal(code: object) -> bool:
+    """Whether an exit code is that of a signal, and not one that code has asked for."""
+    return isinstance(code, int) and code > 128
+
+
 @contextmanager
 def exit_refused() -> Iterator[None]:
-    """Make an error of ``sys.exit()`` and ``sys.exit(0)`` in a user's code, which would end a command as if all were well.
+    """Make an error of ``sys.exit`` in a user's code, which would end a command without a word, and with an exit code that means something else.
 
     Raises:
-        PluginError: The code inside has called one of them.
+        PluginError: The code inside has called it.
     """
     try:
         yield
     except SystemExit as asked:
-        if asked.code not in (None, 0):
+        if is_signal(asked.code):
             raise
         raise PluginError(EXITED) from asked
 

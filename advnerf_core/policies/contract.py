@@ -7,7 +7,7 @@ left, out. A network that was trained otherwise declares how; the declaration is
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from math import pi
 from numbers import Real
@@ -106,6 +106,10 @@ class PolicyContract:
     states: tuple[NetworkState, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in ("mean", "std"):
+            given: Any = getattr(self, name)  # one number, or some in any sequence
+            numbers = tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
+            object.__setattr__(self, name, numbers)
         self._read_sections()
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:

@@ -199,7 +199,7 @@ def _factory_sha256(spec: str, policy: AdaptedPolicy, code: str) -> str:
 def source_sha256(spec: str | os.PathLike[str]) -> str:
     """Hash of a policy's source, without loading it: of a file's content, or of a factory's code.
 
-    It changes whenever the hash of `load_any_policy` does, except for changes of a program that a factory queries.
+    It changes whenever the hash of `load_any_policy` does, except for what a factory reads: weights, or a program that it queries.
 
     Raises:
         PolicyContractError: A file is missing, or the module of a factory cannot be found.

@@ -245,11 +245,12 @@ def _exit_code() -> int:
 
 def _code_of_exit(code: str | int | None) -> int:
     """Exit code of what ended by ``sys.exit``: a signal, the shell's completion before a command, or a user's code inside one."""
-    if isinstance(code, int) and code:
-        return code
     if not _is_in_command:
-        return FAILURE_EXIT if code else 0
-    from advnerf_core.plugins import EXITED
+        return code if isinstance(code, int) else FAILURE_EXIT if code else 0
+    from advnerf_core.plugins import EXITED, is_signal
+
+    if isinstance(code, int) and is_signal(code):
+        return code
 
     say_error(f"{EXITED}({code or ''})")
     return ERROR_EXIT

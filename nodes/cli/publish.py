@@ -72,7 +72,14 @@ def publish(
             "can drive the set again"
         )
     found_here = statuses(experiment, cells)
-    # Before anything is written: a wrong name leaves the folder as it was.
+    # Before anything is written: what cannot be published leaves the folder as it was.
+    if registered:
+        done = {
+            each.cell.name: each.result.registration
+            for each in found_here
+            if each.state == "done" and each.result
+        }
+        registration.require_registered(to / experiment.config.name, done)
     if withdraw:
         finished = {each.cell.name for each in found_here if each.state == "done"}
         registration.withdraw(

@@ -10,7 +10,14 @@ from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.view import PolicyView
 from nodes.runtime.errors import ConfigError
 
-_TOLERANCE_PX = 1e-6
+# A declaration may be rounded; a picture does not show this.
+_TOLERANCE_PX = 0.01
+
+
+def same_camera(one: Pinhole, other: Pinhole) -> bool:
+    """Whether two cameras have the same size, and the same intrinsics but for rounding."""
+    same_size = (one.width, one.height) == (other.width, other.height)
+    return same_size and float(np.abs(one.matrix - other.matrix).max()) <= _TOLERANCE_PX
 
 
 def require_camera(view: PolicyView, mounted: Pinhole, policy: str, file: Path | str) -> None:
@@ -19,10 +26,8 @@ def require_camera(view: PolicyView, mounted: Pinhole, policy: str, file: Path |
     Raises:
         ConfigError: Image size or intrinsics differ.
     """
-    trained = view.camera
-    same_size = (trained.width, trained.height) == (mounted.width, mounted.height)
-    if not same_size or np.abs(trained.matrix - mounted.matrix).max() > _TOLERANCE_PX:
+    if not same_camera(view.camera, mounted):
         raise ConfigError(
-            f"{file}: expected the camera that the policy {policy} was trained with, {trained}; got {mounted}. Use its "
+            f"{file}: expected the camera that the policy {policy} was trained with, {view.camera}; got {mounted}. Use its "
             "calibration, or train the policy again"
         )

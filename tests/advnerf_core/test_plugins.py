@@ -121,7 +121,7 @@ def test_a_file_that_does_not_do_is_one_line(
 
 
 def test_a_user_s_code_does_not_end_a_command_as_if_all_were_well() -> None:
-    for asked in (None, 0):
+    for asked in (None, 0, 1, 3, "no weights"):
         with pytest.raises(PluginError, match=r"to return, it has called sys\.exit"), exit_refused():
             sys.exit(asked)
     with pytest.raises(SystemExit, match="143"), exit_refused():  # asked to end by a signal

@@ -416,7 +416,7 @@ def test_defect_of_ours_keeps_its_traceback(monkeypatch):
         cli.main()
 
 
-@pytest.mark.parametrize("code", [None, 0, "no weights"])
+@pytest.mark.parametrize("code", [None, 0, 1, 3, "no weights"])
 def test_a_users_code_that_exits_inside_a_command_is_an_error(command, monkeypatch, tmp_path, code):
     monkeypatch.setattr("nodes.lab.method_check.check_method", lambda *_: sys.exit(code))
     ended, _, errors = command("attack", "method", "check", "random")

@@ -24,6 +24,7 @@ from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration, save_calibration
 from nodes.bags.writer import BagWriter
 from nodes.cli.main import app
+from nodes.lab.policy_camera import same_camera
 from nodes.lab.policy_reference import from_bag, from_run, from_scene, from_twin, judged_by_drives
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import encode, image_message, pose_message
@@ -113,6 +114,10 @@ def test_a_run_folder_is_seen_through_the_policys_own_crop(tmp_path):
     room = load_calibration(RoomCalibration, ROOM)
     wanted = Expert(room.reference_path).steer_states(about(room.reference_path))
     np.testing.assert_allclose(usual.steering_rad, wanted, atol=1e-6)
+    # A rounded declaration is of the same camera; 0.005 px move a picture by less than its noise.
+    rounded = replace(VIEW.camera, fx=round(VIEW.camera.fx, 2), fy=round(VIEW.camera.fy, 2))
+    assert rounded != VIEW.camera
+    assert same_camera(rounded, VIEW.camera)
     with pytest.raises(ConfigError, match="expected the camera that the policy"):
         from_run(folder, replace(VIEW, camera=replace(VIEW.camera, fx=200.0)))
     with pytest.raises(ConfigError, match="expected the run folder of an experiment"):

@@ -38,6 +38,10 @@ def require_same_steering(experiment, may_go_on=False, say=print):
     pass
 
 
+def require_gradients(experiment, cells):
+    pass
+
+
 def stages_needed(config, victim):
     return ["capture", "policy"]
 

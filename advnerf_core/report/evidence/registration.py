@@ -277,6 +277,27 @@ def require_registration(folder: FilePath) -> Registration:
     return registration
 
 
+def require_registered(folder: FilePath, finished: Mapping[str, str]) -> None:
+    """Refuse finished cells that were registered, and not run under this registration.
+
+    Args:
+        folder: Of the published set.
+        finished: Digest of the registration that each cell was run under, by its name; empty for none.
+
+    Raises:
+        SetError: There is such a cell.
+    """
+    registration = require_registration(folder)
+    names = {cell.name for cell in registration.cells}
+    if others := [
+        name for name, digest in finished.items() if name in names and digest != registration.digest
+    ]:
+        raise SetError(
+            f"{folder}: expected cells that were run under the registration there, got {others[0]}{f' and {len(others) - 1} more' * (len(others) > 1)} "
+            "run without it or under another one; register first, and run in a new run folder"
+        )
+
+
 def withdraw(folder: FilePath, scenarios: Mapping[str, str], finished: Collection[str] = ()) -> None:
     """Withdraw registered scenarios, with reasons that the page of results shows.
 

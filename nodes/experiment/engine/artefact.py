@@ -242,11 +242,12 @@ class ReferenceBuild:
         return target
 
     def _share(self, target: Path) -> None:
-        """Store the files of a stage once that another folder of the same stage has too."""
+        """Store the files of a stage once that another folder of the same stage, also of another victim, has too."""
         ours = read_artefact(target)
         assert ours is not None, "it was kept"
         files, shared = _files_in(target), dict[str, str]()
-        for record in sorted(self.folder.glob(f"{target.name.rpartition('_')[0]}_*/{RECORD}")):
+        stage = target.name.rpartition("_")[0].partition("-")[0]
+        for record in sorted(self.folder.glob(f"{stage}[_-]*/{RECORD}")):
             other = record.parent
             for name in files.keys() - shared.keys() if other != target else ():
                 if (other / name).is_file() and filecmp.cmp(files[name], other / name, shallow=False):

@@ -30,7 +30,7 @@ from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.sections import ResponseConfig
 from nodes.experiment.show.experiment_world import ExperimentWorld
 from nodes.experiment.show.given import given_in, given_victim
-from nodes.lab.policy_camera import require_camera
+from nodes.lab.policy_camera import require_camera, same_camera
 from nodes.lab.policy_data.frames import OWN_VIEW, view_for_camera
 from nodes.lab.worlds.expert_drive import as_path, expert_of
 from nodes.runtime.errors import ConfigError
@@ -180,7 +180,7 @@ class Experiment(ExperimentWorld):
             # A calibrated camera may have distortion, which the policy takes out of its pictures; worlds have none.
             if self.given_scene is not None:
                 require_camera(view, self.camera, policy.policy, f"{self.file}: world.camera")
-            elif view.camera != self.camera or any(view.distortion):
+            elif not same_camera(view.camera, self.camera) or any(view.distortion):
                 raise ConfigError(
                     f"{self.file}: victims.{name}: expected a policy that was trained for the driving camera, {self.camera} without distortion, "
                     f"got {view.camera}{' with distortion' * any(view.distortion)}; correct its declaration, or the world's camera"

@@ -9,7 +9,7 @@ from typing import Any
 from advnerf_core.files import write_json
 from advnerf_core.policies.adapter import adapted
 from advnerf_core.policies.contract import PolicyContract
-from advnerf_core.policies.load import is_address, load_any_policy, source_sha256
+from advnerf_core.policies.load import is_address, is_code, load_any_policy, source_sha256
 from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.policies.view import PolicyView
 from nodes.experiment.show.context import Experiment
@@ -18,7 +18,7 @@ from nodes.runtime.errors import ConfigError
 
 
 def look_at_given(experiment: Experiment) -> None:
-    """Load the existing policies and store their declarations; unchanged ones are not loaded again.
+    """Load the existing policies and store their declarations; unchanged files are not loaded again.
 
     Their view is compared with the world's camera, so that a world which must be open for its description is opened.
 
@@ -45,7 +45,9 @@ def look_at_given(experiment: Experiment) -> None:
 
 def _look_at(experiment: Experiment, spec: str, known: GivenPolicy | None) -> GivenPolicy:
     source = source_sha256(spec)
-    if known is not None and (known.policy, known.source_sha256) == (spec, source) and not known.not_fixed:
+    # What a factory reads, such as weights, is in the hash of what it makes, and not in that of its code.
+    is_fixed = known is not None and not known.not_fixed and not is_code(spec)
+    if known is not None and is_fixed and (known.policy, known.source_sha256) == (spec, source):
         return known
     loaded = _driver_at(experiment, spec) if is_address(spec) else load_any_policy(spec)
     # A network that was trained here has no other declaration.

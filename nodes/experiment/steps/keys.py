@@ -183,6 +183,12 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
     _require_gradient(experiment, cell)
 
 
+def require_gradients(experiment: Experiment, cells: Sequence[Cell]) -> None:
+    """Raise `NoSuchCellError` for the first cell that needs the gradient of a victim without one, before anything is run for it."""
+    for cell in cells:
+        _require_gradient(experiment.of(cell), cell)
+
+
 def _require_gradient(experiment: Experiment, cell: Cell) -> None:
     """Check that a built-in method with a gradient does not attack a black box; users' methods are checked when they search."""
     method = METHODS.get(cell.code)
@@ -190,7 +196,7 @@ def _require_gradient(experiment: Experiment, cell: Cell) -> None:
         return
     if not given_victim(experiment, cell.victim).declared.differentiable:
         raise NoSuchCellError(
-            f"expected methods that need no gradient against victim {cell.victim}, which declares that it has none, got {cell.method}; set "
+            f"{experiment.file}: expected methods that need no gradient against victim {cell.victim}, which declares that it has none, got {cell.method}; set "
             f"over.method to some of {', '.join(black_box_methods())}"
         )
 

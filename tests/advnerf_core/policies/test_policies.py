@@ -453,3 +453,7 @@ def test_a_declaration_that_contradicts_itself_is_one_error(changes, message):
 def test_a_mean_for_all_channels_may_be_a_single_number_in_a_file():
     data = {"view": VIEW.to_dict(), "mean": 127.5, "std": 127.5, "value_max": 255}
     assert PolicyContract.from_dict(data).mean == (127.5,)
+    in_python = PolicyContract(VIEW, mean=127.5, std=[127.5], value_max=255)  # type: ignore[arg-type]
+    assert in_python == PolicyContract.from_dict(data)
+    with pytest.raises(PolicyContractError, match="mean: expected a number, got 'grey'"):
+        PolicyContract(VIEW, mean="grey")  # type: ignore[arg-type]

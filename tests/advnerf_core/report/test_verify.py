@@ -20,6 +20,7 @@ from advnerf_core.report.evidence.registration import (
     WITHDRAWN,
     SetError,
     read_registration,
+    require_registered,
     withdraw,
 )
 from advnerf_core.report.evidence.results import Evidence, primary_tests, read_evidence, rows
@@ -419,6 +420,15 @@ def test_a_scenario_with_a_finished_cell_cannot_be_withdrawn(half_run):
     with pytest.raises(SetError, match="later cannot be withdrawn, as later_hardened_none_0 is finished"):
         withdraw(half_run, {"later": "It did not come out well."}, ["later_hardened_none_0"])
     assert not (half_run / WITHDRAWN).exists()
+
+
+def test_cells_of_another_registration_are_refused_before_they_are_copied(half_run):
+    digest = read_registration(half_run).digest
+    require_registered(half_run, {"later_hardened_none_0": digest, "not_registered_0": ""})
+    with pytest.raises(
+        SetError, match="got later_hardened_none_0 and 1 more run without it or under another"
+    ):
+        require_registered(half_run, {"later_hardened_none_0": "", "later_hardened_random_0": "d" * 64})
 
 
 def weave(folder, amplitude_m):

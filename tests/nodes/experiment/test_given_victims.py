@@ -29,6 +29,8 @@ from nodes.experiment.run.registering import register
 from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import victim_sha256
+from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.keys import driven_folder
 from nodes.experiment.steps.run import load_experiment
@@ -244,6 +246,29 @@ def test_variants_with_stages_of_their_own_are_run_from_nothing(folder: Path, tm
 def test_a_black_box_has_no_gradient(folder: Path) -> None:
     with pytest.raises(AdvnerfError, match=r"need no gradient against victim mine.*over\.method.*cem"):
         run_experiment(loaded(folder, "over.method=[none,random,gradient]"))
+
+
+def test_a_black_box_is_not_registered_for_a_method_with_a_gradient(folder: Path, tmp_path: Path) -> None:
+    experiment = loaded(folder, "over.method=[none,gradient]")
+    with pytest.raises(AdvnerfError, match=r"mine\.experiment\.yaml: .*need no gradient against victim mine"):
+        register(experiment, experiment.cells, tmp_path / "published")
+    assert not (tmp_path / "published").exists()
+
+
+def test_other_weights_that_a_factory_reads_are_another_policy(folder: Path, tmp_path: Path) -> None:
+    """Its code is the same, so only loading it shows the weights."""
+    (folder / "weights.txt").write_text("0")
+    (folder / "reads_weights.py").write_text(
+        MODULE.replace("manual_seed(0)", "manual_seed(int(open('weights.txt').read()))")
+    )
+    change = "victims={module: {policy: 'reads_weights:factory'}}"
+    experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", (change,), tmp_path / "run")
+    hashes = []
+    for seed in ("0", "0", "1"):
+        (folder / "weights.txt").write_text(seed)
+        look_at_given(experiment)
+        hashes.append(victim_sha256(experiment, "module"))
+    assert hashes[0] == hashes[1] != hashes[2]
 
 
 def test_another_policy_under_the_same_name_is_another_cell(folder: Path, tmp_path: Path) -> None:

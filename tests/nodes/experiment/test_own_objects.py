@@ -9,13 +9,11 @@ import trimesh
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.objects.voxel.build import build_from_mesh
-from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh_files import load_mesh
 from advnerf_core.objects.voxel.model import load_object, save_object
-from nodes.experiment.plan.object_kinds import BALL, CUBE, MADE_HERE_M, PANEL, extent_m, footprint_m
+from nodes.experiment.plan.object_kinds import extent_m, footprint_m
 from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.objects import GENERATOR_OF
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
 from tests.nodes.experiment.conftest import write_file
@@ -69,14 +67,6 @@ def test_a_mesh_and_a_built_object_stand_where_they_are_put(tmp_path: Path) -> N
         "billboard.glb",
         "mine.object.safetensors",
     ]
-
-
-@pytest.mark.parametrize("kind", sorted(MADE_HERE_M.keys() - {PANEL, CUBE, BALL}))
-def test_the_extent_of_a_built_in_object_is_that_of_its_mesh(kind: str) -> None:
-    low, high = GENERATORS[GENERATOR_OF[kind]]().box
-    length, width, height = extent_m(kind)
-    assert height == pytest.approx(high[2] - low[2])
-    assert (length, width) == pytest.approx(2.0 * np.abs([low, high]).max(axis=0)[:2], abs=0.03)
 
 
 def test_what_is_in_the_file_counts_and_not_where_it_lies(tmp_path: Path) -> None:

@@ -35,10 +35,11 @@ def test_object_sizes_are_those_of_the_generated_meshes() -> None:
     for kind, mesh in (("hydrant", hydrant()), ("small_car", small_car())):
         low, high = mesh.box
         covered = 2.0 * np.maximum(np.abs(low[:2]), np.abs(high[:2]))
-        size = np.array(MADE_HERE_M[kind])
+        size = np.array(MADE_HERE_M[kind][:2])
         assert (covered <= size + 1e-6).all()
         assert (covered >= 0.8 * size).all()
         assert low[2] == pytest.approx(0.0, abs=0.01)
+        assert high[2] == pytest.approx(MADE_HERE_M[kind][2])
 
 
 def test_five_objects_stand_clear_of_every_lane(experiment: Experiment) -> None:
