@@ -80,7 +80,8 @@ def write_above_of(folder: Path) -> Path | None:
     if not has_stills(data):
         return write_maps(evidence, maps, target)
     place = about.object if about else None
-    return write_above(evidence, data["primary"][-1], filmed_of(data), place, film, target)
+    ((shown,),) = maps
+    return write_above(evidence, shown, filmed_of(data), place, film, target)
 
 
 def write_maps(evidence: Evidence, maps: Sequence[Sequence[Mapping[str, Any]]], target: Path) -> Path:

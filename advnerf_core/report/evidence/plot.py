@@ -78,7 +78,7 @@ def _means(shown: list[Row], titles: Mapping[str, str]) -> Figure:
             ax.plot([row.excess_m], [down], marker=style.marker, ls="none", label=label, **drawn)
         entries = dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
         # The widest legend has the titles of coarse methods in all columns.
-        spacing = {"columnspacing": 0.8, "handletextpad": 0.4} if len(entries) > 12 else {}
+        spacing = {"columnspacing": 0.8, "handletextpad": 0.4} if len(entries) >= 12 else {}
         ax.figure.legend(entries.values(), entries.keys(), loc="outside upper left", ncols=3, **spacing)
         names = [f"{scenario}, {titles.get(victim, victim)}" for scenario, victim in places]
         ax.set_yticks(range(len(places)), [name.replace("_", " ") for name in names])

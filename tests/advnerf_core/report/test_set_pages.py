@@ -19,6 +19,7 @@ from advnerf_core.report.evidence.above import (
     write_maps,
 )
 from advnerf_core.report.evidence.page import above_of, film_of, groups_of_searches, maps_of, searched_apart
+from advnerf_core.report.evidence.plot import excess_plot
 from advnerf_core.report.evidence.registration import SetError
 from advnerf_core.report.evidence.results import read_evidence, rows
 from advnerf_core.report.evidence.verify import verify_beside, verify_set
@@ -58,6 +59,25 @@ def test_every_set_shows_its_drives_from_above_and_what_the_camera_saw(name):
     assert Image.open(picture).size[0] == 1200
     assert (PUBLISHED / film_of(name)).exists()  # the stills are frames of it
     assert several or "Place of the object:" in text or "The place of the object was not kept" in text
+
+
+def test_the_map_beside_the_stills_is_of_the_method_that_they_show(monkeypatch):
+    """A coarser attack, which is tested against other baselines, is not drawn for the one in the film."""
+    shown = []
+    monkeypatch.setattr(
+        "advnerf_core.report.evidence.above.write_above",
+        lambda _, test, film, *__: shown.extend((test, film)),
+    )
+    write_above_of(PUBLISHED / "paper_monitor")
+    assert [each["test"]["method"] for each in shown] == ["gradient", "gradient"]
+    assert published("paper_monitor")["primary"][-1]["test"]["method"] == "gradient_coarse"
+
+
+def test_the_legend_of_the_excesses_is_inside_its_picture():
+    figure = excess_plot(read_evidence(PUBLISHED / "victim_panel"), {})
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert legend.get_window_extent().x1 <= figure.bbox.x1
 
 
 @pytest.mark.parametrize("name", SETS)
