@@ -88,14 +88,9 @@ class RecorderNode(Node):
         self._writer.flush()
         return []
 
-    @property
-    def messages(self) -> int:
-        """Messages that were written."""
-        return self._writer.messages
-
     def status(self) -> tuple[str, str]:
         """Report active, with the number of messages."""
-        return "active", f"{self.messages} messages in {self._writer.folder}"
+        return "active", f"{self._writer.messages} messages in {self._writer.folder}"
 
     def counters(self) -> dict[str, float]:
         """Report lost messages."""

@@ -149,9 +149,9 @@ def bag_record(
     run_dir: RunDir = None,
 ) -> None:
     """Record the topics of a running launch until Ctrl-C."""
+    from nodes.bags.reader import read_info
     from nodes.launching.watching import find_run_dir, node_names
     from nodes.recorder import RecorderConfig, RecorderNode
-    from nodes.runtime.node import NodeContext
     from nodes.runtime.paths import require_new
     from nodes.runtime.process import run_node
 
@@ -163,14 +163,8 @@ def bag_record(
     limits = {"max_bag_duration_s": max_bag_duration_s, "max_bag_size_mb": max_bag_size_mb}
     config = config.model_copy(update={key: value for key, value in limits.items() if value is not None})
     print(f"recording to {folder}; press Ctrl-C to stop", flush=True)
-    built: list[RecorderNode] = []
-
-    def build(context: NodeContext) -> RecorderNode:
-        built.append(RecorderNode.build(config, context))
-        return built[0]
-
-    code = run_node(build, "bag_record", run)
-    if code == 0 and built and built[0].messages == 0:
+    code = run_node(lambda context: RecorderNode.build(config, context), "bag_record", run)
+    if code == 0 and read_info(folder).messages == 0:
         say_error(f"recorded 0 messages in {folder}: no node has published a topic to record")
         code = FAILURE_EXIT
     raise typer.Exit(code)

@@ -73,15 +73,14 @@ def publish(
         )
     found_here = statuses(experiment, cells)
     # Before anything is written: what cannot be published leaves the folder as it was.
+    finished = {
+        each.cell.name: each.result.registration
+        for each in found_here
+        if each.state == "done" and each.result
+    }
     if registered:
-        done = {
-            each.cell.name: each.result.registration
-            for each in found_here
-            if each.state == "done" and each.result
-        }
-        registration.require_registered(to / experiment.config.name, done)
+        registration.require_registered(to / experiment.config.name, finished)
     if withdraw:
-        finished = {each.cell.name for each in found_here if each.state == "done"}
         registration.withdraw(
             to / experiment.config.name,
             dict(key_and_value("--withdraw", each, "left=REASON", "NAME=REASON") for each in withdraw),

@@ -102,14 +102,13 @@ def _times_repeat(rows: Sequence[CsvRow]) -> bool:
     """
     repeat = False
     for name in (each for each in (rows[0].values if rows else ()) if _TIMES.fullmatch(each)):
-        for before, after in pairwise(rows):
-            step = _time(after.values[name]) - _time(before.values[name])
-            if step < 0.0:
+        for (before, earlier), (after, later) in pairwise((row, _time(row.values[name])) for row in rows):
+            if later < earlier:
                 raise LogError(
                     f"{after.place}: {name}: expected times that go forward, got {after.values[name]!r:.40} after {before.values[name]!r:.40}; "
                     "sort the rows, give each drive a file of its own, or rename the column if it has no times"
                 )
-            repeat |= step == 0.0
+            repeat |= later == earlier
     return repeat
 
 

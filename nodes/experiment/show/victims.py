@@ -46,8 +46,7 @@ def look_at_given(experiment: Experiment) -> None:
 def _look_at(experiment: Experiment, spec: str, known: GivenPolicy | None) -> GivenPolicy:
     source = source_sha256(spec)
     # What a factory reads, such as weights, is in the hash of what it makes, and not in that of its code.
-    is_fixed = known is not None and not known.not_fixed and not is_code(spec)
-    if known is not None and is_fixed and (known.policy, known.source_sha256) == (spec, source):
+    if known is not None and not is_code(spec) and (known.policy, known.source_sha256) == (spec, source):
         return known
     loaded = _driver_at(experiment, spec) if is_address(spec) else load_any_policy(spec)
     # A network that was trained here has no other declaration.
