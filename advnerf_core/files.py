@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
+import threading
 from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
@@ -14,18 +16,24 @@ from advnerf_core.places import PlaceError, require_utf8
 
 PART = ".part"
 """End of the name of an output while it is written."""
+_PART_OF_A_THREAD = re.compile(r"(\.\d+)?\.part$")
 
 
-def write_atomically(path: Path, data: str | bytes) -> None:
-    """Write a whole file or nothing: under a temporary name first, synced, then renamed over ``path``."""
+def write_atomically(path: Path, data: str | bytes, *, synced: bool = True) -> None:
+    """Write a whole file or nothing: under a temporary name first, then renamed over ``path``. Of several that write it at once the last counts.
+
+    Args:
+        synced: Whether to wait for the disk. A file that is not waited for may be lost in a power cut.
+    """
     require_utf8(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + PART)
+    temporary = path.with_name(f"{path.name}.{threading.get_native_id()}{PART}")
     try:
         with temporary.open("wb") as stream:
             stream.write(data.encode() if isinstance(data, str) else data)
-            stream.flush()
-            os.fsync(stream.fileno())
+            if synced:
+                stream.flush()
+                os.fsync(stream.fileno())
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -67,7 +75,7 @@ def write_json(path: Path, data: Any) -> None:
 def not_writable(path: str | os.PathLike[str], error: OSError) -> str:
     """Text of an error about an output that cannot be made."""
     why = error.strerror or str(error)
-    return f"expected a folder that can be written to, got {os.fsdecode(path).removesuffix(PART)} ({why}); give another with -o or --folder"
+    return f"expected a folder that can be written to, got {_PART_OF_A_THREAD.sub('', os.fsdecode(path))} ({why}); give another with -o or --folder"
 
 
 def sha256_of(file: Path) -> str:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.driving.metrics import DriveMetrics, Horizon
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_json
+from advnerf_core.files import write_atomically, write_json
 from advnerf_core.geometry import Array, invert_transform
 from advnerf_core.policies.load import load_driver
 from calibration.schema import CameraCalibration, RoomCalibration, TargetCalibration, load_calibration
@@ -101,10 +101,7 @@ def _describe(folder: Path, text: str, file: str, film: bool) -> None:
 def _picture_writer(file: Path) -> Show:
     def show(rgb: Rgb) -> None:
         _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-        # Replaced without waiting for the disk, which live nodes need too.
-        part = file.with_suffix(".part")
-        part.write_bytes(jpeg.tobytes())
-        part.replace(file)
+        write_atomically(file, jpeg.tobytes(), synced=False)  # live nodes need the disk too
 
     return show
 

@@ -1,4 +1,5 @@
 import json
+import threading
 
 import numpy as np
 import pytest
@@ -22,6 +23,30 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
         write_atomically(target, 3)
     assert json.loads(target.read_text()) == [1]
     assert [p.name for p in tmp_path.iterdir()] == ["kept.json"]
+
+
+def test_several_that_write_one_file_at_once_do_not_disturb_each_other(tmp_path):
+    """As two processes do that begin one run."""
+    target, failed = tmp_path / "manifest.json", []
+    texts = [str(k) * 20_000 for k in range(4)]
+    together = threading.Barrier(len(texts))
+
+    def write(text):
+        together.wait()
+        try:
+            for _ in range(50):
+                write_atomically(target, text, synced=False)
+        except OSError as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=write, args=(text,)) for text in texts]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    assert not failed
+    assert target.read_text() in texts
+    assert [p.name for p in tmp_path.iterdir()] == ["manifest.json"]
 
 
 def test_the_same_content_is_the_same_bytes(tmp_path):

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from advnerf_core.documents import read_json
+from advnerf_core.files import write_atomically
 from nodes.runtime.progress import MeasuringReport, Point
 
 if TYPE_CHECKING:  # the page's server reads records without importing the searches
@@ -158,16 +159,10 @@ class ProgressRecord:
                 "log": self._log,
             }
             try:
-                self._replace(json.dumps(data) + "\n")
+                # Not waited for: the record may be lost in a power cut, and must not slow the experiment.
+                write_atomically(self._file, json.dumps(data) + "\n", synced=False)
             except OSError:
                 self._broken = True
-
-    def _replace(self, text: str) -> None:
-        """Replace the file without waiting for the disk: the record may be lost in a power cut, and must not slow the experiment."""
-        self._file.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self._file.with_name(self._file.name + ".part")
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(self._file)
 
 
 def read_progress(folder: Path) -> dict[str, Any]:
