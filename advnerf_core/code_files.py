@@ -1,4 +1,4 @@
-"""Hashes of users' code: of its files, and of the versions of the packages that it imports.
+"""Users' code: hashes of its files and of the versions of the packages that it imports, and the line that raised an error.
 
 Two rules. The hash of a plug-in ``file.py`` includes the modules beside it that it imports, directly or through others. The hash of a module
 includes all Python files of its package; without a package, the files of its folder.
@@ -9,7 +9,10 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
+import os
 import sys
+import sysconfig
+import traceback
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from importlib.metadata import EntryPoint, packages_distributions, version
@@ -21,6 +24,10 @@ _CACHE = "__pycache__"
 # This project's own code counts by the versions in keys, even for a plug-in beside it.
 _OURS = {"advnerf_core", "calibration", "hardware", "nodes"}
 _LARGE_BYTES = 1 << 20
+_OF_NO_USER = (
+    *(sysconfig.get_paths()[name] + os.sep for name in ("stdlib", "purelib", "platlib")),
+    *(str(Path(__file__).parents[1] / name) + os.sep for name in _OURS),
+)
 
 
 def modules_beside(file: Path) -> list[Path]:
@@ -33,6 +40,14 @@ def modules_beside(file: Path) -> list[Path]:
                     found.add(each)
                     waiting.append(each)
     return sorted(found - {file})
+
+
+def line_of_a_user(error: BaseException) -> str:
+    """``file.py:line`` of the innermost call that is in neither this software nor a library; empty if there is none."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if os.path.isfile(frame.filename) and not frame.filename.startswith(_OF_NO_USER):
+            return f"{frame.filename}:{frame.lineno}"
+    return ""
 
 
 def file_sha256(file: Path) -> str:

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from advnerf_core.code_files import entry_point_sha256, file_sha256, modules_beside
+from advnerf_core.code_files import entry_point_sha256, file_sha256, line_of_a_user, modules_beside
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.places import expanded
 from advnerf_core.strict import strict_validator, what_is_wrong
@@ -333,8 +333,10 @@ def exit_refused() -> Iterator[None]:
 
 
 def in_one_line(error: BaseException) -> str:
-    """Type and text of an error, without line breaks."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+    """Type and text of an error, without line breaks; of one that a user's code has raised also the file and line."""
+    text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    where = "" if isinstance(error, AdvnerfError) else line_of_a_user(error)
+    return f"{text} ({where})" if where else text
 
 
 def _article(what: str) -> str:

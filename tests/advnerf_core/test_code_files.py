@@ -1,4 +1,4 @@
-"""Hashes of users' code: plug-ins with the modules beside them, installed packages, modules of policies."""
+"""Users' code: hashes of plug-ins with the modules beside them, of installed packages, of modules of policies; lines of errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from advnerf_core import code_files
 from advnerf_core.code_files import file_sha256, module_sha256, modules_beside
 from advnerf_core.files import sha256_of
-from advnerf_core.plugins import PluginError, code_sha256, load_from_file, resolve
+from advnerf_core.plugins import PluginError, code_sha256, in_one_line, load_from_file, resolve
 
 GROUP = "advnerf.test_things"
 
@@ -149,3 +149,20 @@ def test_a_compiled_module_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
         file.write_bytes(content)
         found.append(module_sha256("a_compiled_module"))
     assert len({*found, sha256().hexdigest()}) == 3
+
+
+def test_an_error_of_a_users_code_names_the_line_that_called_the_library(tmp_path: Path) -> None:
+    folder = write(
+        tmp_path,
+        helper="import json\n\n\ndef read(text):\n    return json.loads(text)\n",
+        mine="import helper\n\n\ndef Mine(text):\n    return helper.read(text)\n",
+    )
+    mine = load_from_file(f"{folder / 'mine.py'}:Mine", "thing")
+    with pytest.raises(ValueError) as error:
+        mine("no JSON")
+    assert in_one_line(error.value) == (
+        f"JSONDecodeError: Expecting value: line 1 column 1 (char 0) ({folder / 'helper.py'}:5)"
+    )
+    with pytest.raises(PluginError) as refused:
+        load_from_file(f"{folder / 'mine.py'}:Other", "thing")
+    assert ".py:" not in in_one_line(refused.value).replace("mine.py:Other", "")

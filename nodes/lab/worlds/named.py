@@ -22,6 +22,7 @@ from advnerf_core.strict import is_of_settings, validate
 from hardware.worlds import ENTRY_POINTS
 from hardware.worlds import WORLDS as DRIVEN
 from hardware.worlds.world import Traits, World, WorldClass, WorldDescription, members_of_a_world, traits_of
+from nodes.lab.worlds.held import held_to_its_word
 from nodes.runtime.errors import ConfigError
 
 _PAGE = "docs/worlds.md"
@@ -62,12 +63,14 @@ class NamedWorld:
     source_sha256: str
 
     def make(self) -> World:
-        """Construct the world, without opening it.
+        """Construct the world, without opening it. One of a user's own is checked at each call, see `held_to_its_word`.
 
         Raises:
             ConfigError: The class lacks a member that every world must have.
+            OwnWorldError: A world of a user's own has failed.
         """
-        world = self.world_class(self.config)
+        made = held_to_its_word(self.world_class, self.kind) if self.source_sha256 else self.world_class
+        world = made(self.config)
         # For a property only the class is checked: a world that is not open may not know its value.
         known = (set(dir(type(world))), set(vars(world)) if hasattr(world, "__dict__") else set())
         missing = [name for name in members_of_a_world() if not any(name in names for names in known)]

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.geometry import Array, Pinhole, planar_pose
+from advnerf_core.geometry import Array, planar_pose
 from hardware.worlds.world import Rgb, require_depth, traits_of
 from nodes.lab.worlds.bench import WorldBench, pose_of
+from nodes.lab.worlds.held import form_of, require_depth_of, require_picture
 from nodes.runtime.findings import NotMet
 
 # Below this spread a picture counts as one colour [grey levels].
@@ -31,19 +32,10 @@ def form(bench: WorldBench) -> str:
     finite = []
     for place in bench.places:
         rgb, depth = world.observe_at(*place)
-        _require_picture(rgb, camera, "observe_at")
-        if (
-            not isinstance(depth, np.ndarray)
-            or depth.shape != (camera.height, camera.width)
-            or depth.dtype != np.float32
-        ):
-            raise NotMet(
-                f"expected depth [{camera.height}, {camera.width}] float32 in metres; got {_form_of(depth)}; convert it"
-            )
-        if np.isnan(depth).any() or not (depth > 0.0).all():
-            raise NotMet(
-                f"expected depth above 0, infinite where nothing is hit; got values from {np.nanmin(depth):.3g} and {int(np.isnan(depth).sum())} NaN"
-            )
+        require_picture(rgb, camera, "observe_at")
+        _require_something(rgb, "observe_at")
+        require_depth_of(depth, camera, "observe_at")
+        assert depth is not None
         finite.append(float(np.isfinite(depth).mean()))
         kept, kept_depth = rgb.copy(), depth.copy()
         world.observe_at(*bench.beside(place, 0.0, 0.0, 0.5))
@@ -57,10 +49,10 @@ def form(bench: WorldBench) -> str:
         )
     without = world.observe_at(*bench.places[0], depth=False)[1]
     if without is not None:
-        raise NotMet(f"expected None for the depth of observe_at(depth=False); got {_form_of(without)}")
-    _require_picture(
-        world.photograph(planar_pose(*bench.places[0]) @ world.T_car_from_camera), photo, "photograph"
-    )
+        raise NotMet(f"expected None for the depth of observe_at(depth=False); got {form_of(without)}")
+    photograph = world.photograph(planar_pose(*bench.places[0]) @ world.T_car_from_camera)
+    require_picture(photograph, photo, "photograph")
+    _require_something(photograph, "photograph")
     return f"views {camera.width} x {camera.height}, photographs {photo.width} x {photo.height}, depth finite in {100 * min(finite):.0f} % of each view or more"
 
 
@@ -195,22 +187,11 @@ def _script(bench: WorldBench) -> list[tuple[str, NDArray[Any]]]:
     return [*found, ("photo pose", np.array(poses)), ("photograph", world.photograph(poses[0]))]
 
 
-def _require_picture(rgb: Any, pinhole: Pinhole, name: str) -> None:
-    expected = (pinhole.height, pinhole.width, 3)
-    if not isinstance(rgb, np.ndarray) or rgb.shape != expected or rgb.dtype != np.uint8:
-        raise NotMet(f"expected a picture {list(expected)} uint8 from {name}; got {_form_of(rgb)}")
-    if not rgb.flags.c_contiguous:
-        raise NotMet(
-            f"expected a contiguous picture from {name}; got a view with other strides; use numpy.ascontiguousarray"
-        )
+def _require_something(rgb: Rgb, name: str) -> None:
     if float(rgb.std()) < _LEAST_SPREAD:
         raise NotMet(
             f"expected something to be seen in {name}; got a picture of one colour, {rgb.reshape(-1, 3)[0].tolist()}"
         )
-
-
-def _form_of(array: Any) -> str:
-    return f"{array.dtype} {list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__
 
 
 def _difference(one: Rgb, other: Rgb) -> float:
