@@ -38,7 +38,7 @@ def require_same_steering(experiment, may_go_on=False, say=print):
     pass
 
 
-def require_gradients(experiment, cells):
+def require_searchable(experiment, cells):
     pass
 
 

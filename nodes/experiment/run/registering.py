@@ -36,7 +36,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import given_in, given_victim
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import planned_evaluations
-from nodes.experiment.steps.keys import own_recipes, registered_settings, require_gradients
+from nodes.experiment.steps.keys import own_recipes, registered_settings, require_searchable
 from nodes.experiment.steps.verdicts import VALIDATED_ON, trained_on, unseen
 
 
@@ -81,7 +81,7 @@ def _scenarios(experiment: Experiment, cells: Sequence[Cell]) -> dict[str, Regis
             look_at_given(variant)  # their hashes are fixed before anything is run
             variant.ask_world()
             found[cell.scenario] = registered_scenario(variant, cell.path)
-    require_gradients(experiment, cells)
+    require_searchable(experiment, cells)
     return found
 
 

@@ -21,7 +21,7 @@ from nodes.experiment.run.store import NOT_DRIVEN, Store
 from nodes.experiment.run.worker import Ended, Job, Phase, run_here, run_in_process, wait_for_live
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.victims import look_at_given
-from nodes.experiment.steps.keys import require_gradients
+from nodes.experiment.steps.keys import require_searchable
 from nodes.experiment.steps.run import prepare_victims
 from nodes.experiment.steps.steering_gate import require_same_steering
 from nodes.lab.trials.tries import allow_more_tries
@@ -192,7 +192,7 @@ def _prepare(experiment: Experiment, cells: Sequence[Cell], options: Options, sa
     wanted = {cell.variant: experiment.of(cell) for cell in cells}
     for each in wanted.values():
         look_at_given(each)
-    require_gradients(experiment, cells)
+    require_searchable(experiment, cells)
     _refuse_two_in_one_folder(experiment, cells)
     for name, variant in {each.folder: (name, each) for name, each in reversed(wanted.items())}.values():
         say(f"{name or variant.config.name}: {variant.folder}")

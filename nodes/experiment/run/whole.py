@@ -24,7 +24,7 @@ from nodes.experiment.run.store import FINISHED, NOT_DRIVEN
 from nodes.experiment.run.worker import Ended
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.victims import look_at_given
-from nodes.experiment.steps.keys import require_gradients
+from nodes.experiment.steps.keys import require_searchable
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import make_ready
 from nodes.experiment.steps.steering_gate import require_same_steering
@@ -62,7 +62,7 @@ def run_experiment(
     check_until(stages, until)
     chosen = select(experiment.cells, only)
     if until in (None, REPORT):
-        require_gradients(experiment, chosen)
+        require_searchable(experiment, chosen)
     if record is not None:
         names = [stage.name for stage in stages]
         until_there = names if until is None else names[: names.index(until) + 1]

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from advnerf_core.attack.methods import METHODS, black_box_methods, method_digest, require_method
-from advnerf_core.attack.objectives import ON_THE_PATH, objective_key
+from advnerf_core.attack.methods import METHODS, black_box_methods, load_method, method_digest, require_method
+from advnerf_core.attack.objectives import OBJECTIVES, ON_THE_PATH, load_objective, objective_key
 from advnerf_core.plugins import PluginError
 from advnerf_core.report.conditions import EMPTY, NONE
 from nodes.experiment.engine.artefact import Settings, digests_in, hash_of
@@ -183,10 +183,31 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
     _require_gradient(experiment, cell)
 
 
-def require_gradients(experiment: Experiment, cells: Sequence[Cell]) -> None:
-    """Raise `NoSuchCellError` for the first cell that needs the gradient of a victim without one, before anything is run for it."""
+def require_searchable(experiment: Experiment, cells: Sequence[Cell]) -> None:
+    """Load the user's own objective and method of each cell, before anything is made for it, and check that its victim has the gradient that the method needs.
+
+    Raises:
+        NoSuchCellError: Code of a user's own cannot be loaded or is of another kind, the world lacks what the objective needs, or a black box would
+            be attacked by a gradient; with the file.
+    """
     for cell in cells:
-        _require_gradient(experiment.of(cell), cell)
+        inside = experiment.of(cell)
+        try:
+            _require_objective(inside)
+            if cell.method != NONE and cell.code not in METHODS:
+                load_method(cell.code)
+        except PluginError as error:
+            raise NoSuchCellError(f"{experiment.file}: {error}") from None
+        _require_gradient(inside, cell)
+
+
+def _require_objective(experiment: Experiment) -> None:
+    objective = experiment.config.attack.objective  # a built-in one was checked when the file was read
+    if objective not in OBJECTIVES and load_objective(objective).needs_solids and experiment.solids is None:
+        raise NoSuchCellError(
+            f"{experiment.file}: expected an objective that needs no solids, as the world {experiment.named_world.kind} does not say what its car can "
+            f"hit, got {objective}; choose another, or add solids to the world (docs/worlds.md)"
+        )
 
 
 def _require_gradient(experiment: Experiment, cell: Cell) -> None:

@@ -1,6 +1,7 @@
 """An experiment maximises the objective that its file names."""
 
 import json
+import re
 import shutil
 
 import pytest
@@ -8,8 +9,9 @@ import pytest
 from advnerf_core.attack.artifact import load_attack
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import run_cell
+from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.steps.attack import ATTACK
-from nodes.experiment.steps.keys import cell_settings, registered_settings, settings_hash
+from nodes.experiment.steps.keys import NoSuchCellError, cell_settings, registered_settings, settings_hash
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
 from tests.support.stage_versions import ROOT, TINY
@@ -71,3 +73,29 @@ def test_a_collision_needs_a_world_with_solids(tiny_room, tmp_path):
     warehouse = ROOT / "examples" / "warehouse.experiment.yaml"
     with pytest.raises(ConfigError, match=r"attack.objective: expected an objective that needs no solids"):
         load_experiment(warehouse, "demo", ["attack.objective=collision"], tmp_path / "other")
+
+
+BROKEN = {
+    "no class of ours": (
+        "class Left:\n    pass\n",
+        r"expected a class that derives from Objective .*, got the class Left",
+    ),
+    "an error": (
+        "1 / 0\n",
+        r"mine\.py cannot be loaded: ZeroDivisionError: division by zero \(.*mine\.py:1\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", ["attack.objective", "over.method"])
+@pytest.mark.parametrize("fault", BROKEN)
+def test_code_that_cannot_be_searched_with_is_refused_before_any_stage(tmp_path, what, fault):
+    (tmp_path / "mine.py").write_text(BROKEN[fault][0])
+    reference = f"{tmp_path / 'mine.py'}:Left"
+    change = f"{what}={reference}" if what == "attack.objective" else f"over.method=[none,'{reference}']"
+    experiment = load_experiment(FILE, "demo", [*TINY, change], tmp_path / "run")
+    with pytest.raises(NoSuchCellError, match=rf"room\.experiment\.yaml: .*{reference}") as error:
+        run_experiment(experiment)
+    if what == "attack.objective":
+        assert re.search(BROKEN[fault][1], str(error.value)), error.value
+    assert not list((tmp_path / "run").glob("*/stage.json"))
