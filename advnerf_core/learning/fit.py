@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from math import cos, pi
+from math import cos, isfinite, pi
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advnerf_core.adam import Adam
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import read_tensors, write_tensors
 from advnerf_core.learning.augment import AugmentConfig, Changes
 from advnerf_core.learning.frames import Batch, FrameSet, FrameStoreError
@@ -30,6 +31,10 @@ from advnerf_core.policies.number_type import layer_type
 
 EVALUATION_BATCH = 128
 _PARTS = 2  # of a batch: smaller ones cost more than a third and fourth core would save
+
+
+class DivergedError(AdvnerfError, ArithmeticError):
+    """A network's errors or weights are no longer numbers."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +76,10 @@ def fit(
         report: Called with the step and the running mean square error [rad^2].
         number_type: float32 or bfloat16, of the layers of a network with ``rows_independent``; None for the machine's
             (`layer_type`). Other networks are trained in float32.
+
+    Raises:
+        FrameStoreError: There are no frames to train on.
+        DivergedError: The errors or the weights are no longer numbers; the last checkpoint is of before.
     """
     if len(frames.training) == 0:
         raise FrameStoreError(
@@ -85,6 +94,7 @@ def fit(
     with freed_blocks_kept():
         for step in range(done, config.steps):
             error, found = gradients.of_step(frames, step)
+            _require_number(error, f"step {step + 1} of {config.steps}", config)
             optimiser.step(_learning_rate(config, step), found)
             running = error if step == done else 0.95 * running + 0.05 * error
             finished = step + 1
@@ -93,7 +103,17 @@ def fit(
                 _write(checkpoint, policy, optimiser, finished, config)
             if report is not None and (finished % 10 == 0 or last):
                 report(finished, running)
+    largest = max((float(each.detach().abs().max()) for each in policy.parameters()), default=0.0)
+    _require_number(largest, "its last step", config)
     policy.eval()
+
+
+def _require_number(value: float, where: str, config: FitConfig) -> None:
+    if not isfinite(value):
+        raise DivergedError(
+            f"expected training with errors and weights that are numbers, got {value} at {where}: it diverges. Lower the learning rate of "
+            f"{config.learning_rate:g}, or look for a layer whose values grow without bound"
+        )
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ from advnerf_core.driving.rollout import drive
 from advnerf_core.geometry import Pinhole, VehicleState, camera_mount, planar_pose
 from advnerf_core.learning import imitation
 from advnerf_core.learning.augment import Changes
-from advnerf_core.learning.fit import FitConfig, Gradients, fit, mean_absolute_error
+from advnerf_core.learning.fit import DivergedError, FitConfig, Gradients, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
 from advnerf_core.learning.imitation import TrainedPolicy, train_policy
 from advnerf_core.learning.recipe import ImitationConfig, SourcePlan, recovery_states
@@ -247,6 +247,26 @@ def test_fit_resumes_to_the_bit(tmp_path: Path, number_type: torch.dtype) -> Non
     (tmp_path / "part.safetensors").write_bytes(b"rubbish")
     with pytest.raises(FrameStoreError, match="delete it to start again"):
         fit(resumed, frames, config, tmp_path / "part.safetensors")
+
+
+def test_a_training_that_diverges_says_so_and_writes_no_checkpoint_of_it(tmp_path: Path) -> None:
+    class Growing(PilotNet):
+        def forward(self, *inputs):
+            return super().forward(*inputs) / next(self.parameters()).detach().mul(0.0).sum()
+
+    frames, config = _small_set(), FitConfig(steps=6, batch_size=8, checkpoint_every=1, learning_rate=0.5)
+    with pytest.raises(
+        DivergedError, match=r"got (nan|inf) at step 1 of 6: .* Lower the learning rate of 0\.5"
+    ):
+        fit(Growing(), frames, config, tmp_path / "a.safetensors")
+    assert not list(tmp_path.iterdir())
+
+
+def test_weights_that_the_last_step_spoils_are_no_policy() -> None:
+    frames = _small_set()
+    config = FitConfig(steps=1, batch_size=8, learning_rate=1e38, warm_up_steps=0, weight_decay=1e10)
+    with pytest.raises(DivergedError, match=r"got (nan|inf) at its last step"):
+        fit(PilotNet(), frames, config)
 
 
 def test_fit_learns_in_either_number_type() -> None:
