@@ -213,6 +213,16 @@ def test_the_check_finds_what_is_wrong(
         CHECKS[part](CameraBench(camera))
 
 
+def test_the_check_of_a_camera_that_never_returns_ends(generator: Path) -> None:
+    """As a driver that waits for its device, whatever the time-out."""
+    generator.write_text(GENERATOR.replace("wait_s > timeout_s", "time.sleep(1e6)"))
+    bench = CameraBench(parse_source(f"{{kind: {generator}:Generator, width: 6}}").camera())
+    findings = camera_check.check_camera(bench, most_s=2.0)
+    assert not findings[-1].met
+    assert "not ended after 2 s; make read(timeout_s) return None" in findings[-1].text
+    assert len(findings) < len(CHECKS)
+
+
 def test_the_check_tells_bgr_from_rgb(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "0.png"), np.full((4, 6, 3), RED[::-1], np.uint8))
     camera = parse_source(f"{{kind: folder, folder: {tmp_path}}}").camera()
