@@ -113,6 +113,11 @@ def publish(
             raise SetError(f"{to / part.name}: cannot be published: {part.problems[0]}")
         if part is not None:
             print(f"{to / part.name}: its numbers are published when {part.awaits} more cells are there")
+        else:
+            print(
+                f"{experiment.config.name} is not registered, so its cells are no evidence and have no page here; register an experiment before it "
+                "is run, see advnerf experiment register"
+            )
         write_beside(to)
     unfinished = len(cells) - len(found.written) - len(found.same)
     print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")

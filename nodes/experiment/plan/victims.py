@@ -21,6 +21,7 @@ from nodes.experiment.plan.sections import PolicyConfig
 from nodes.lab.located import beside, refusal
 
 # Policies that the section policy trains, and the first one's retrained version; a user's victims have other names.
+_GIVEN, _TRAINED = "a given policy", "a trained policy"
 HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"
 
 # Names become parts of file names, which are separated by "_" and ".".
@@ -90,12 +91,19 @@ class TrainedVictim(StrictModel):
     )
 
 
-def _tag(value: Any) -> str:
-    given = isinstance(value, GivenVictim) or (isinstance(value, dict) and "policy" in value)
-    return "a given policy" if given else "a trained policy"
+def _tag(value: Any) -> str | None:
+    if isinstance(value, dict):
+        return next((tag for key, tag in (("policy", _GIVEN), ("train", _TRAINED)) if key in value), None)
+    return (
+        _GIVEN if isinstance(value, GivenVictim) else _TRAINED if isinstance(value, TrainedVictim) else None
+    )
 
 
 VictimConfig = Annotated[
-    Annotated[GivenVictim, Tag("a given policy")] | Annotated[TrainedVictim, Tag("a trained policy")],
-    Discriminator(_tag),
+    Annotated[GivenVictim, Tag(_GIVEN)] | Annotated[TrainedVictim, Tag(_TRAINED)],
+    Discriminator(
+        _tag,
+        custom_error_type="victim",
+        custom_error_message="expected {policy: FILE} of one that exists, or {train: {}} of one that is trained here",
+    ),
 ]

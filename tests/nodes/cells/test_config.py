@@ -144,6 +144,14 @@ def test_a_claim_is_about_cells_that_are_there(file, change, told):
             r"over.victim: expected a victim in room of hardened; got 'naive'",
         ),
         ("measure.seed=-1", "measure.seed: .* greater than or equal to 0, got -1"),
+        (f"measure.seed={10**30}", "measure.seed: .* less than or equal to 2147483647, got 10{30}$"),
+        *(
+            (
+                f"victims={{mine: {text}}}",
+                r"victims.mine: expected \{policy: FILE\} .* or \{train: \{\}\} .*, got",
+            )
+            for text in ("{}", "{polcy: a.onnx}", "a.onnx", "null")
+        ),
     ],
 )
 def test_cells_are_of_victims_and_paths_that_exist(file, change, told):

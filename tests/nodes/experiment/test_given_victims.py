@@ -289,7 +289,7 @@ def test_another_policy_under_the_same_name_is_another_cell(folder: Path, tmp_pa
     [
         ("victims={mine: {policy: no.onnx}}", r"victims\.mine\.policy: expected a policy file.*no\.onnx, which is not there"),
         ("victims={mine: {policy: my_driver.py}}", r"my_driver\.py; name a function in it"),
-        ("victims={mine: {}}", r"victims\.mine\.train is missing"),
+        ("victims={mine: {}}", r"victims\.mine: expected \{policy: FILE\} .* or \{train: \{\}\}"),
         ("victims={mine: {policy: my.onnx, train: {}}}", r"unknown key victims\.mine\.train; valid keys here: policy"),
         ("victims={retrained: {policy: my.onnx}}", r"other names than retrained"),
         ("victims={a: {train: {}}, b: {train: {}}}", r"a, b, of which two would be the same policy"),
