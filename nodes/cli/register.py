@@ -19,10 +19,12 @@ def register(choice: CellChoice) -> None:
             f"expected the folder of published sets, {published}, in the working folder {Path.cwd()}, found none; change to your checkout, or make it"
         )
     experiment, cells = load_cells(choice)
+    was_there = (published / experiment.config.name / FILE).exists()
     found = write_registration(experiment, cells, published)
+    what_next = f"registered before, on {found.date}" if was_there else "commit it, then run the experiment"
     print(f"{published / found.name / FILE}: {found.digest[:12]}")
     print(
-        f"{len(found.cells)} cells, {len(found.scenarios)} paths and variants, {len(found.primary)} primary tests; commit it, then run the experiment"
+        f"{len(found.cells)} cells, {len(found.scenarios)} paths and variants, {len(found.primary)} primary tests; {what_next}"
     )
     for name, scenario in found.scenarios.items():
         limit_m = scenario.drives_well_mean_cte_m

@@ -164,6 +164,16 @@ def test_registering_names_the_folder_that_runs_look_into(tmp_path, monkeypatch)
     )
 
 
+def test_registering_again_says_when_it_was_and_does_not_ask_to_run_it(tmp_path, monkeypatch):
+    (tmp_path / "docs" / "results").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    command = ["experiment", "register", str(LAUNCH / "paper_car_long.experiment.yaml")]
+    first, again = (CliRunner().invoke(app, command, catch_exceptions=False).output for _ in range(2))
+    (date,) = (json.loads(each.read_text())["date"] for each in tmp_path.rglob(FILE))
+    assert "2 primary tests; commit it, then run the experiment\n" in first
+    assert f"2 primary tests; registered before, on {date}\n" in again
+
+
 def test_a_registration_after_the_fact_is_refused(experiment, tmp_path):
     planned = plan_cells(experiment, experiment.cells[:1])[0]
     work = experiment.folder / "cells" / planned.cell.name
