@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from advnerf_core.documents import read_json
@@ -20,6 +21,14 @@ def is_kept(folder: Path) -> bool:
     kept = {read_json(file).get("digest") for file in (folder.parent / BUILD).glob(f"*/{RECORD}")}
     used = _digests_used(folder, registration) if registration is not None else []
     return bool(used) and all(digest in kept for digest in used)
+
+
+def stage_problems(published: Path) -> Iterator[str]:
+    """Files of a stage that its record says are stored in the folder of another, and are not there."""
+    for record in sorted((published / BUILD).glob(f"*/{RECORD}")):
+        for name, folder in sorted(read_json(record).get("files_in", {}).items()):
+            if not (published / BUILD / folder / name).is_file():
+                yield f"{record}: {name} is stored in {folder}, and is not there; restore it from git"
 
 
 def lost_note(folder: Path) -> list[str]:

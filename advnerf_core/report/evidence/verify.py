@@ -13,6 +13,7 @@ from pathlib import Path
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.report.evidence.about import check_about
+from advnerf_core.report.evidence.kept_build import stage_problems
 from advnerf_core.report.evidence.publishing import page_text
 from advnerf_core.report.evidence.registration import read_withdrawn
 from advnerf_core.report.evidence.results import Evidence, read_evidence
@@ -87,7 +88,7 @@ def _verified(
 
 def verify_beside(published: Path) -> tuple[str, ...]:
     """Problems of the page of all sets, the pictures and films, the reference build and the sets without a registration."""
-    problems = list(beside_problems(published))
+    problems = [*beside_problems(published), *stage_problems(published)]
     page = published / PAGE
     try:
         check_about(published, sets_in(published))

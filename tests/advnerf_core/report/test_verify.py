@@ -25,6 +25,7 @@ from advnerf_core.report.evidence.registration import (
 )
 from advnerf_core.report.evidence.results import Evidence, primary_tests, read_evidence, rows
 from advnerf_core.report.evidence.verify import verify_beside, verify_set
+from advnerf_core.report.evidence.verifying.digests import write_beside
 from advnerf_core.report.evidence.verifying.drives import drive_problems
 from advnerf_core.report.evidence.verifying.layout import BESIDE, DIGESTS, PAGE, SET, sets_in
 from advnerf_core.report.evidence.verifying.pictures import picture_problems
@@ -498,6 +499,22 @@ def test_pictures_films_and_the_reference_build_are_those_of_their_manifest(copi
         file.write_bytes(data)
     (published / BESIDE).unlink()
     assert "advnerf experiment publish writes it" in verify_beside(published)[0]
+
+
+def test_a_file_that_another_stage_stores_is_missed_though_the_manifest_was_written_anew(copied):
+    published = copied.parent
+    record = published / "reference/scene_0/stage.json"
+    record.write_text(json.dumps({"digest": "", "files_in": {"views.bin": "scene_1"}}))
+    stored = published / "reference/scene_1/views.bin"
+    stored.parent.mkdir()
+    stored.write_bytes(b"views")
+    write_beside(published)
+    assert verify_beside(published) == ()
+    stored.unlink()
+    write_beside(published)
+    assert verify_beside(published) == (
+        f"{record}: views.bin is stored in scene_1, and is not there; restore it from git",
+    )
 
 
 def test_a_picture_of_something_else_is_found_by_drawing_it_again(copied):
