@@ -38,6 +38,7 @@ _DONE = "advnerf_strict"
 _NOT_SCHEMAS = frozenset({"metadata", "default", "serialization", "expected", "config", "cls", "ref"})
 # In pydantic's path of a wrong value: a tag of several words, a type with parameters, the name of a class.
 _INSERTED = re.compile(r"[ \[]|^[A-Z][A-Za-z0-9]*[a-z][A-Za-z0-9]*$")
+_DOTTED = re.compile(r"[a-z_]\w*(?:\.\w+)+")
 # Types of pydantic errors that name a Python type, and what a file has instead.
 _NOT_OF_YAML = {
     "tuple_type": "a list in brackets",
@@ -272,10 +273,17 @@ def _explain(model: Any, document: Document, error: ValidationError) -> list[str
     lines: dict[Key, str] = {}
     for problem in problems:
         key = _as_written(document.data, tuple(problem["loc"]))
+        told = what_is_wrong(model, key, problem)
         # A value with several possible types fails as each of them.
-        lines.setdefault(key, f"{document.place(key)}: {what_is_wrong(model, key, problem)}")
+        lines.setdefault(key, f"{document.place(key or _named_in(told, document))}: {told}")
     # A list with a wrong item is too short as well, and a section is no word.
     return [line for key, line in lines.items() if not any(key == each[: len(key)] != each for each in lines)]
+
+
+def _named_in(told: str, document: Document) -> Key:
+    """The first key with dots, in the message of a check of several keys, that the user wrote; empty if there is none."""
+    keys = (tuple(name.split(".")) for name in _DOTTED.findall(told))
+    return next((key for key in keys if key in document.places), ())
 
 
 def what_is_wrong(model: Any, key: Key, problem: Any) -> str:

@@ -34,7 +34,7 @@ def test_settings_lie_over_the_file_and_the_command_line_over_both(tmp_path):
         (["attack.horizon=0"], r"attack\.horizon.*greater than or equal to 1"),
         (
             ["attack.horizon=61"],
-            r"attack\.horizon to be at most horizon = 60 ticks, which are measured, got 61",
+            r"^--set attack\.horizon=61: expected attack\.horizon to be at most horizon = 60 ticks, which are measured, got 61",
         ),
         (["carrier={kind: screen, display_model: sometimes}"], r"display_model.*valid boolean"),
         (["carrier.display_model=false"], r"unknown key .*display_model"),
@@ -55,6 +55,15 @@ def test_settings_lie_over_the_file_and_the_command_line_over_both(tmp_path):
 def test_a_wrong_value_is_one_error_with_the_way_out(tmp_path, overrides, message):
     with pytest.raises(ConfigError, match=message):
         room(tmp_path, "demo", *overrides)
+
+
+def test_a_check_of_several_keys_has_the_line_of_the_first_that_was_written(tmp_path):
+    file = tmp_path / "mine.experiment.yaml"
+    file.write_text(f"name: mine\nbase: {ROOM}\nsetting: demo\n\nattack:\n  starts: 1\n  horizon: 61\n")
+    with pytest.raises(
+        ConfigError, match=r"mine\.experiment\.yaml:7: expected attack\.horizon to be at most"
+    ):
+        load_experiment(file, None, [], None)
 
 
 def test_an_unknown_setting_names_those_there_are(tmp_path):
