@@ -22,6 +22,7 @@ def write_posed_images(
     suffix: Literal["jpg", "png"],
     *,
     keep: bool = False,
+    valid: Sequence[Callable[[], NDArray[np.bool_]] | None] = (),
     told: Callable[[int], None] = lambda count: None,
 ) -> int:
     """Write ``images/00000.<suffix>`` and so on and, when all exist, their ``transforms.json``; without poses, no files.
@@ -32,18 +33,26 @@ def write_posed_images(
         see: Takes the picture ``[h, w, 3]`` of an index.
         suffix: ``png`` where pixels are compared, ``jpg`` where a scene is learned from them.
         keep: Skip existing pictures, to resume a capture. The caller must make sure that they belong to these poses.
+        valid: For each picture, what reads which pixels ``[h, w]`` count, or None where all do; stored as masks. None for all if it is empty.
         told: Progress callback, called after each picture with the number of existing ones.
 
     Returns:
         Number of pictures taken in this call.
     """
     names = [f"images/{index:05d}.{suffix}" for index in range(len(poses))]
+    masks: list[str | None] = [None] * len(names)
     taken = 0
     for index, name in enumerate(names):
         if not (keep and (folder / name).exists()):
             write_image(folder / name, see(index))
             taken += 1
+        if valid and (read := valid[index]) is not None:
+            masks[index] = f"masks/{index:05d}.png"
+            write_image(
+                folder / f"masks/{index:05d}.png",
+                np.dstack([np.where(read(), np.uint8(255), np.uint8(0))] * 3),
+            )
         told(index + 1)
     if names:
-        write_transforms(folder / "transforms.json", names, np.stack(poses), pinhole)
+        write_transforms(folder / "transforms.json", names, np.stack(poses), pinhole, masks=masks)
     return taken

@@ -357,10 +357,12 @@ class Photograph:
     Attributes:
         T_world_from_camera: Pose ``[4, 4]`` of the camera.
         look: Reads the photograph: colours ``[h, w, 3]``, undistorted, and their intrinsics.
+        valid: Reads which of its pixels ``[h, w]`` are learned from; None if all are.
     """
 
     T_world_from_camera: Array
     look: Callable[[], tuple[Rgb, Pinhole]]
+    valid: Callable[[], NDArray[np.bool_]] | None = None
 
 
 @runtime_checkable

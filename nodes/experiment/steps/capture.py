@@ -83,7 +83,13 @@ def _write(folder: Path, photographs: Sequence[Photograph], told: Callable[[int]
 
     # The images are learned from and compared with, so they are stored without further loss.
     write_posed_images(
-        folder, [each.T_world_from_camera for each in photographs], pinholes, look, "png", told=told
+        folder,
+        [each.T_world_from_camera for each in photographs],
+        pinholes,
+        look,
+        "png",
+        valid=[each.valid for each in photographs],
+        told=told,
     )
 
 

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from advnerf_core.data.image_files import write_image
 from advnerf_core.data.posed_images import write_posed_images
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import Document
 from advnerf_core.errors import AdvnerfError, ConfigError
 from advnerf_core.geometry import (
@@ -262,3 +264,43 @@ def test_nothing_can_be_driven_or_photographed_anew(tmp_path: Path) -> None:
             ask()
     with pytest.raises(WorldError, match=r"capture\.held_out from 3 to a third of the 12"):
         found.photographs(5)
+
+
+def masked(folder: Path, some: slice) -> Path:
+    """A lap of photographs, some with a mask that hides their left half."""
+    photographs(folder)
+    (folder / "masks").mkdir()
+    data = json.loads((folder / "transforms.json").read_text())
+    half = np.zeros((PINHOLE.height, PINHOLE.width, 3), np.uint8)
+    half[:, PINHOLE.width // 2 :] = 255
+    write_image(folder / "masks" / "half.png", half)
+    for frame in data["frames"][some]:
+        frame["mask_path"] = "masks/half.png"
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return folder
+
+
+def test_masked_photographs_are_learned_from_and_not_compared_with(tmp_path: Path) -> None:
+    masked(tmp_path / "images_of_mine", slice(None, None, 2))
+    learned, held_out = place(tmp_path).photographs(5)
+    assert not any(each.valid for each in held_out)
+    assert sum(each.valid is not None for each in learned) == 20
+    write_posed_images(
+        tmp_path / "taken", [each.T_world_from_camera for each in learned], PINHOLE,
+        lambda index: learned[index].look()[0], "png", valid=[each.valid for each in learned],
+    )  # fmt: skip
+    taken = load_transforms(tmp_path / "taken").load()
+    assert taken.valid is not None
+    for index, each in enumerate(learned):
+        expected = np.ones((PINHOLE.height, PINHOLE.width), bool)
+        if each.valid is not None:
+            expected[:, : PINHOLE.width // 2] = False
+        assert np.array_equal(np.asarray(taken.valid[index]), expected)
+
+
+def test_views_that_all_have_a_mask_are_told(tmp_path: Path) -> None:
+    masked(tmp_path / "images_of_mine", slice(4, None))
+    with pytest.raises(
+        WorldError, match=r"to a third of the 4 photographs along the path, got 3; 36 more have a mask"
+    ):
+        place(tmp_path).photographs(3)

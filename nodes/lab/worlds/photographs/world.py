@@ -10,9 +10,10 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from advnerf_core.data.posed_image import PosedImage
-from advnerf_core.data.view_loading import load_image
+from advnerf_core.data.view_loading import load_image, load_view
 from advnerf_core.geometry import Array, Pinhole, camera_mount, invert_transform, make_transform
 from hardware.worlds.world import Box, Photograph, Rgb, WorldDescription, WorldError
 from nodes.lab.worlds.photographs.config import PhotographsConfig, read_images
@@ -68,7 +69,7 @@ class Photographs(Undriven):
     @cached_property
     def _listed(self) -> tuple[PosedImage, ...]:
         """The photographs that were taken while driving, as they are listed."""
-        return self._checked(self.config.driven.frames)
+        return tuple(self.config.driven.frames)
 
     @cached_property
     def _driven(self) -> tuple[PosedImage, ...]:
@@ -80,14 +81,7 @@ class Photographs(Undriven):
 
     @cached_property
     def _all(self) -> tuple[PosedImage, ...]:
-        return self._checked(read_images(self.config.images).frames)
-
-    def _checked(self, frames: tuple[PosedImage, ...]) -> tuple[PosedImage, ...]:
-        if masked := [each.path.name for each in frames if each.mask is not None]:
-            raise WorldError(
-                f"expected photographs without masks, got {len(masked)} with one, first {masked[0]}; remove the masks"
-            )
-        return frames
+        return tuple(read_images(self.config.images).frames)
 
     def _cars_of(self, driven: Sequence[PosedImage]) -> Array:
         """``T_images_from_car [N, 4, 4]`` of driven photographs."""
@@ -155,15 +149,19 @@ class Photographs(Undriven):
         """Photographs to learn from, and held-out views of the driving camera.
 
         Args:
-            held_out: Number of photographs to hold out, equally spaced among those taken while driving, or nearest to the path.
+            held_out: Number of photographs to hold out, equally spaced among those taken while driving, or nearest to the path, that have no
+                mask: a masked one is not all that the driving camera sees.
 
         Raises:
             WorldError: Too few photographs.
         """
-        along = self.along
+        along = [each for each in self.along if each.mask is None]
         if not 3 <= held_out <= len(along) // 3:
+            masked = (
+                f"; {len(self.along) - len(along)} more have a mask" if len(along) < len(self.along) else ""
+            )
             raise WorldError(
-                f"expected capture.held_out from 3 to a third of the {len(along)} photographs along the path, got {held_out}"
+                f"expected capture.held_out from 3 to a third of the {len(along)} photographs along the path, got {held_out}{masked}"
             )
         chosen = [along[index] for index in np.linspace(0, len(along) - 1, held_out + 2).astype(int)[1:-1]]
         left_out = {each.path for each in chosen}
@@ -193,7 +191,12 @@ class Photographs(Undriven):
             rgb, own = load_image(image)
             return (rgb, own) if pinhole is None else (_through(pinhole, rgb, own, image.path), pinhole)
 
-        return Photograph(pose, look)
+        def valid() -> NDArray[np.bool_]:
+            found = load_view(image).valid
+            assert found is not None  # it has a mask
+            return found
+
+        return Photograph(pose, look, None if image.mask is None else valid)
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
         """Poses of the photographs, for any ``count``."""
