@@ -30,7 +30,6 @@ from advnerf_core.strict import (
     validate,
     within_a_turn,
 )
-from advnerf_core.unit_bounds import MOST_LENGTH_M
 from calibration.fence import inside, require_simple
 from hardware.motor.limits import DriveLimits, VehicleGains
 
@@ -39,7 +38,13 @@ Point3 = tuple[float, float, float]
 Point2 = tuple[float, float]
 _RIGID_TOLERANCE = 1e-6
 _PLANAR_TOLERANCE_M = 0.005
-_LARGEST_FACE_M = 50.0
+_LARGEST_FACE_M = 20.0  # a billboard of 14 x 48 feet has 15 m
+# Of a driving camera: the rear axle of a lorry is not further away, and one whose axis is turned by more looks at no road.
+_FURTHEST_CAMERA_M, _LEAST_AHEAD = 5.0, 0.5
+_LONGEST_WHEELBASE_M, _MOST_LATENCY_S = 8.0, 1.0
+_SKEW = 0.1
+# Of a fence to the extent of the path: a room is not that much larger.
+_MOST_ROOM = 25.0
 _OPTIONAL = ("views", "residuals", "response")
 
 
@@ -123,16 +128,23 @@ class CameraCalibration(Intrinsics):
 
     kind: Literal["camera"] = "camera"
     T_car_from_camera: tuple[Row4, Row4, Row4, Row4]
-    latency_s: LagS = 0.0
+    latency_s: Annotated[float, at_most(_MOST_LATENCY_S, "s", "ms")] = 0.0
 
     @field_validator("T_car_from_camera")
     @classmethod
     def _rigid(cls, rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
-        if max(abs(row[3]) for row in rows) > MOST_LENGTH_M:
+        if max(abs(row[3]) for row in rows) > _FURTHEST_CAMERA_M:
             raise ValueError(
-                f"expected a camera at most {MOST_LENGTH_M:g} m from the rear axle; is it in cm or mm?"
+                f"expected a camera at most {_FURTHEST_CAMERA_M:g} m from the rear axle; is it in cm or mm?"
             )
-        return require_rigid(rows)
+        require_rigid(rows)
+        # The camera's z axis looks into the picture, its y axis down (OpenCV); the car's x axis points ahead, its z axis up.
+        if rows[0][2] < _LEAST_AHEAD or rows[2][1] > -_LEAST_AHEAD:
+            raise ValueError(
+                "expected a camera that looks ahead, upright, with OpenCV's axes (x right, y down, z forward): column 3 of the rotation near "
+                f"1 0 0 and column 2 near 0 0 -1; got {rows[0][2]:.2f} {rows[1][2]:.2f} {rows[2][2]:.2f} and {rows[0][1]:.2f} {rows[1][1]:.2f} {rows[2][1]:.2f}"
+            )
+        return rows
 
     @property
     def mount(self) -> Array:
@@ -206,7 +218,7 @@ class VehicleCalibration(Calibration):
     """
 
     kind: Literal["vehicle"] = "vehicle"
-    wheelbase_m: LengthM = Field(gt=0.0)
+    wheelbase_m: Annotated[float, at_most(_LONGEST_WHEELBASE_M, "m", "cm or mm")] = Field(gt=0.0)
     gains: GainsSection
     limits: LimitsSection
     response: ResponseSection | None = None
@@ -256,6 +268,13 @@ class TargetCalibration(Calibration):
             raise ValueError(
                 f"expected four corners in one plane, the third is {off * 1000:.1f} mm off: measure again"
             )
+        sides = points - np.roll(points, 1, axis=0)
+        diagonals = np.linalg.norm(points[2:] - points[:2], axis=1)
+        size_m = float(diagonals.max())
+        if np.abs(sides[:2] + sides[2:]).max() > _SKEW * size_m or np.ptp(diagonals) > _SKEW * size_m:
+            raise ValueError(
+                "expected the corners of a rectangle in the order top left, top right, bottom right, bottom left; got others, measure again"
+            )
         return corners
 
     @property
@@ -301,6 +320,11 @@ class RoomCalibration(Calibration):
         if not any(inside((x, y), self.fence_m) for x, y in points):
             raise ValueError(
                 "expected the path inside fence_m, but all of it is outside; are both in m, in the same frame?"
+            )
+        extent_m, room_m = (float(np.ptp(np.array(each), axis=0).max()) for each in (points, self.fence_m))
+        if room_m > _MOST_ROOM * extent_m:
+            raise ValueError(
+                f"expected a fence_m of at most {_MOST_ROOM:g} times the path's extent of {extent_m:.2g} m, got {room_m:.4g} m; are both in m?"
             )
         return self
 

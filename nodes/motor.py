@@ -12,7 +12,6 @@ its firmware can), and the front wheels were confirmed to turn.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +21,7 @@ from pydantic import Field
 from advnerf_core.strict import LagS, StrictModel
 from calibration.schema import VehicleCalibration, load_calibration
 from hardware.errors import HardwareError, ProtocolError
-from hardware.motor.limits import DriveLimits, Sent
+from hardware.motor.limits import Sent
 from hardware.motor.vesc import Vesc
 from hardware.motor.vesc_replies import Values
 from hardware.motor.vesc_settings import TimeoutSettings
@@ -32,6 +31,7 @@ from nodes.control.motor_watch import ControllerWatch
 from nodes.control.stamps import COMMAND_AGE_S, REQUEST_AGE_S, ClockWatch, stamp_age_s, stamp_problem
 from nodes.control.steering_check import CheckSettings
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import header, stamp_ns, types
 from nodes.runtime.node import ACTIVE, FAULT, READY, STARTING, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
@@ -54,7 +54,6 @@ class MotorConfig(StrictModel):
         brake_current_a: Brake current of a stop [A].
         brake_ramp_s: Time over which the brake current rises from a third to its full value [s].
         brake_hold_s: Duration of braking, after which the motor is released [s].
-        current_max_a: Largest commanded current [A]; None uses the calibration's. It can only lower the calibration's.
         link_timeout_s: Time without an answer of the controller after which the link is faulty [s].
         controller_timeout_ms: Longest accepted command time-out of the controller [ms].
         controller_brake_current_a: Smallest accepted brake current of the controller after its time-out [A].
@@ -68,10 +67,9 @@ class MotorConfig(StrictModel):
     calibration: Path
     command_age_limit_s: float = Field(default=0.22, gt=0.0, le=0.25)
     stamp_age_limit_s: float = Field(default=COMMAND_AGE_S, gt=0.0, le=0.55)
-    brake_current_a: float = Field(default=20.0, gt=0.0, le=60.0)
+    brake_current_a: float = Field(default=20.0, ge=1.0, le=60.0)
     brake_ramp_s: float = Field(default=0.1, ge=0.0, le=0.5)
-    brake_hold_s: float = Field(default=1.0, gt=0.0)
-    current_max_a: float | None = Field(default=None, gt=0.0)
+    brake_hold_s: float = Field(default=1.0, ge=0.5, le=60.0)
     link_timeout_s: LagS = Field(default=0.2, gt=0.0)
     controller_timeout_ms: int = Field(default=1000, gt=0, le=5000)
     controller_brake_current_a: float = Field(default=0.0, ge=0.0)
@@ -129,8 +127,12 @@ class MotorNode(Node):
     def build(cls, config: MotorConfig, context: NodeContext) -> MotorNode:
         """Build the node. The first tick opens the port, and later ticks reopen it after a disconnection."""
         car = load_calibration(VehicleCalibration, config.calibration)
-
-        limits = drive_limits(car, config.current_max_a)
+        limits = car.drive_limits
+        if limits.current_max_a < config.brake_current_a:
+            raise ConfigError(
+                f"expected limits.current_max_a of {config.calibration} of at least brake_current_a, {config.brake_current_a:g} A, got "
+                f"{limits.current_max_a:g} A, which would weaken every stop; correct either"
+            )
 
         def make() -> Vesc:
             return Vesc(config.port, car.vehicle_gains, limits, config.brake_current_a)
@@ -328,14 +330,6 @@ class MotorNode(Node):
             fault=values.fault,
             fault_text=values.fault_name if values.fault else "",
         )
-
-
-def drive_limits(car: VehicleCalibration, current_max_a: float | None) -> DriveLimits:
-    """Limits of the driver, from the calibration, with a lower current if the node's configuration asks for one [A]."""
-    limits = car.drive_limits
-    if current_max_a is None:
-        return limits
-    return replace(limits, current_max_a=min(limits.current_max_a, current_max_a))
 
 
 if __name__ == "__main__":

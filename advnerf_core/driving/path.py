@@ -13,6 +13,7 @@ from advnerf_core.geometry import wrap_angle
 
 Array = NDArray[np.float64]
 
+_WRITTEN = "{start_pose: [x_m, y_m, yaw_rad], segments: [{line_m: ...} or {arc_radius_m: ..., arc_angle_rad: ...}, ...], closed: true or false}"
 # A closed path must return to its start with this accuracy [m and rad].
 CLOSURE_TOLERANCE = 1e-6
 
@@ -169,18 +170,21 @@ class Path:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Path:
-        """Rebuild a path from :meth:`to_dict`."""
+        """Rebuild a path from :meth:`to_dict`.
+
+        Raises:
+            ValueError: A key is missing, unknown, or has a value of another type.
+        """
+        if not isinstance(data, Mapping) or set(data) != {"start_pose", "segments", "closed"}:
+            raise ValueError(f"expected a path {_WRITTEN}, got {data!r:.200}")
+        if not isinstance(data["closed"], bool):
+            raise ValueError(f"expected closed of a path to be true or false, got {data['closed']!r}")
         try:
-            pieces: list[Line | Arc] = [
-                Line(piece["line_m"])
-                if "line_m" in piece
-                else Arc(piece["arc_radius_m"], piece["arc_angle_rad"])
-                for piece in data["segments"]
-            ]
-            x, y, yaw = data["start_pose"]
-            return cls((x, y, yaw), pieces, bool(data["closed"]))
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"expected a path as written by Path.to_dict, got {data!r}") from error
+            pieces = [_piece(piece) for piece in data["segments"]]
+            x, y, yaw = map(_number, data["start_pose"])
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"expected a path {_WRITTEN}, got {data!r:.200}: {error}") from error
+        return cls((x, y, yaw), pieces, data["closed"])
 
     def _chain(self) -> Array:
         poses = [np.array(self.start_pose)]
@@ -239,6 +243,21 @@ class Path:
         normal = np.stack([-np.sin(pose[..., 2]), np.cos(pose[..., 2])], axis=-1)
         cte = np.sum(normal * (xy - pose[..., :2]), axis=-1)
         return Projection(s, cte, pose[..., 2], np.asarray(self._curvatures[index]), normal)
+
+
+def _piece(data: Any) -> Line | Arc:
+    """A segment of :meth:`Path.to_dict`."""
+    if isinstance(data, Mapping) and set(data) == {"line_m"}:
+        return Line(_number(data["line_m"]))
+    if isinstance(data, Mapping) and set(data) == {"arc_radius_m", "arc_angle_rad"}:
+        return Arc(_number(data["arc_radius_m"]), _number(data["arc_angle_rad"]))
+    raise TypeError(f"no segment is {data!r:.100}")
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"no number is {value!r:.40}")
+    return float(value)
 
 
 def _advance(pose: Array, curvature: ArrayLike, distance: Array) -> Array:

@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 
+from advnerf_core.data.image_files import natural_order
 from hardware.cameras.played import PlayedCamera
 from hardware.errors import DeviceNotFound, LinkLost
 
@@ -14,7 +15,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 
 
 class FileCamera(PlayedCamera):
-    """Delivers the images of a folder in the order of their names.
+    """Delivers the images of a folder in the order of the numbers in their names; hidden files are none of them.
 
     Args:
         loop: Start over after the last image. Otherwise the device is lost, like an unplugged camera.
@@ -27,7 +28,8 @@ class FileCamera(PlayedCamera):
 
     def open(self) -> None:
         """List the images."""
-        self._files = sorted(p for p in self.path.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
+        found = (p for p in self.path.glob("[!.]*") if p.suffix.lower() in IMAGE_SUFFIXES)
+        self._files = sorted(found, key=lambda path: natural_order(path.name))
         if not self._files:
             self.close()
             raise DeviceNotFound(f"expected images ({', '.join(IMAGE_SUFFIXES)}) in {self.path}, found none")

@@ -49,6 +49,11 @@ class DriveLimits:
             )
 
 
+# A wheel of 0.4 m without a gear and one pole pair has 24, one of 0.02 m with a gear of 15 and seven pole pairs 50,000.
+_LEAST_ERPM_PER_MPS, _MOST_ERPM_PER_MPS = 10.0, 1e5
+_MOST_CREEP_MPS = 0.3
+
+
 @dataclass(frozen=True)
 class VehicleGains:
     """Affine maps between the car's motion and its motor controller, in the form of the RACECAR family.
@@ -78,6 +83,14 @@ class VehicleGains:
         ):
             raise ValueError(
                 f"expected gains that are not zero, servo limits in 0..1 and servo_offset between them, got {self}"
+            )
+        if not _LEAST_ERPM_PER_MPS <= abs(self.erpm_per_mps) <= _MOST_ERPM_PER_MPS:
+            raise ValueError(
+                f"expected erpm_per_mps from {_LEAST_ERPM_PER_MPS:g} to {_MOST_ERPM_PER_MPS:g} 1/(m/s) in magnitude, is it per km/h or per mm/s? Got {self}"
+            )
+        if abs(self.erpm_offset) > _MOST_CREEP_MPS * abs(self.erpm_per_mps):
+            raise ValueError(
+                f"expected an erpm_offset of at most {_MOST_CREEP_MPS:g} m/s, the wheels stand still at it; got {self}"
             )
         if (self.servo_max - self.servo_min) / abs(self.servo_per_rad) > math.pi:
             raise ValueError(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from advnerf_core.geometry import transform_points
+from advnerf_core.geometry import make_transform, transform_points
 from calibration.by_construction import twin_calibrations, write_twin_calibrations
 from calibration.schema import (
     CalibrationError,
@@ -32,6 +32,15 @@ MODELS = {
     "monitor": TargetCalibration,
     "room": RoomCalibration,
 }
+
+
+# A camera's rotation, its axes in the car's: it looks ahead, upright (OpenCV).
+AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+PATH = yaml.safe_load((SHIPPED / "room.yaml").read_text())["path"]
+
+
+def mounted(R_car_from_camera, x_m=0.3):
+    return make_transform(R_car_from_camera, [x_m, 0.0, 0.2]).tolist()
 
 
 @pytest.mark.parametrize("name", sorted(MODELS))
@@ -123,8 +132,46 @@ def edited(tmp_path, name, **changes):
             {"corners_in_subject_m": [[0, -500, 500], [0, 500, 500], [0, 500, -500], [0, -500, -500]]},
             "cm or mm",
         ),
-        ("camera", {"latency_s": 30.0}, "5 s, not ms"),
-        ("vehicle", {"wheelbase_m": 25.0}, "20 m, not cm or mm"),
+        ("camera", {"latency_s": 4.0}, "1 s, not ms"),
+        ("vehicle", {"wheelbase_m": 15.0}, "8 m, not cm or mm"),
+        ("camera", {"T_car_from_camera": mounted(AHEAD, 19.0)}, r"at most 5 m from .*; is it in cm or mm"),
+        (
+            "camera",
+            {"T_car_from_camera": mounted(np.eye(3))},
+            r"looks ahead, upright, .* got 0\.00 0\.00 1\.00",
+        ),
+        ("camera", {"T_car_from_camera": mounted(AHEAD * [1, -1, -1])}, "looks ahead, upright"),
+        ("camera", {"T_car_from_camera": mounted(AHEAD * [-1, -1, 1])}, "looks ahead, upright"),
+        (
+            "room",
+            {"fence_m": [[-350, -350], [350, -350], [350, 350], [-350, 350]]},
+            r"25 times the path's extent of 4 m, got 700 m",
+        ),
+        (
+            "board",
+            {"corners_in_subject_m": [[0, -50, 100], [0, 50, 100], [0, 50, 0], [0, -50, 0]]},
+            "at most 20 m",
+        ),
+        (
+            "board",
+            {"corners_in_subject_m": [[0, -1, 2], [0, 1, 2], [0, -1, 0], [0, 1, 0]]},
+            "rectangle in the order",
+        ),
+        (
+            "board",
+            {"corners_in_subject_m": [[0, -1, 2], [0, 1, 3], [0, 1, 1], [0, -1, 0]]},
+            "rectangle in the order",
+        ),
+        *(
+            ("room", {"path": PATH | change}, told)
+            for change, told in (
+                ({"radius_cm": 5}, r"expected a path \{start_pose"),
+                ({"segments": [{"line_m": 1.8, "arc_radius_m": 1.1, "arc_angle_rad": 1.5}]}, "no segment is"),
+                ({"segments": [{"line_m": 1.8, "colour": "red"}]}, "no segment is"),
+                ({"segments": [{"line_m": True}]}, "no number is True"),
+                ({"closed": "no"}, "expected closed of a path to be true or false, got 'no'"),
+            )
+        ),
     ],
 )
 def test_wrong_files_are_one_clear_error(tmp_path, name, changes, words):
@@ -151,6 +198,9 @@ def test_wrong_files_are_one_clear_error(tmp_path, name, changes, words):
         ("gains", {"servo_offset": 5.0}, "servo_offset between them"),
         ("gains", {"servo_offset": 0.9}, "servo_offset between them"),
         ("gains", {"servo_per_rad": -0.0212}, "per degree"),
+        ("gains", {"erpm_per_mps": 4.614e9}, "is it per km/h or per mm/s"),
+        ("gains", {"erpm_per_mps": 4.614}, "is it per km/h or per mm/s"),
+        ("gains", {"erpm_offset": 5000.0}, "at most 0.3 m/s, the wheels stand still"),
     ],
 )
 def test_impossible_sections_are_found_when_the_file_is_read(tmp_path, section, values, words):
@@ -170,7 +220,7 @@ def test_what_was_measured_impossibly_is_one_clear_error(tmp_path):
     vehicle = load_calibration(VehicleCalibration, SHIPPED / "vehicle.yaml")
     values = {name: getattr(vehicle, name) for name in VehicleCalibration.model_fields}
     assert measured(VehicleCalibration, **values) == vehicle
-    with pytest.raises(CalibrationError, match="what was measured: wheelbase_m: expected at most 20 m"):
+    with pytest.raises(CalibrationError, match="what was measured: wheelbase_m: expected at most 8 m"):
         measured(VehicleCalibration, **values | {"wheelbase_m": 325.0})
 
 

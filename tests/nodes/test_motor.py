@@ -8,14 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from calibration.schema import VehicleCalibration, load_calibration
+from advnerf_core.documents import parse_yaml
+from advnerf_core.strict import validate
+from calibration.schema import VehicleCalibration, load_calibration, save_calibration
 from hardware.emulators.vesc_emulator import VescEmulator
 from hardware.emulators.vesc_firmware import VescEmulatorConfig
 from hardware.motor.vesc import Vesc
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
-from nodes.motor import MotorConfig, MotorNode, drive_limits
+from nodes.motor import MotorConfig, MotorNode
 from nodes.runtime.clock import SystemClock
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import drive_message, ns_from_stamp
 from nodes.runtime.node import MessageInfo
 from nodes.runtime.twin_port import claim_twins_port
@@ -173,10 +176,17 @@ def test_vehicle_file_reaches_the_driver():
     assert vesc.gains.erpm(0.8) == pytest.approx(3691.2)
 
 
-@pytest.mark.parametrize(
-    ("calibrated_a", "asked_a", "limit_a"), [(30.0, None, 30.0), (30.0, 60.0, 30.0), (60.0, 25.0, 25.0)]
-)
-def test_the_current_of_the_calibration_can_only_be_lowered(calibrated_a, asked_a, limit_a):
+def test_a_limit_of_the_current_that_would_weaken_a_stop_is_refused(tmp_path):
     car = load_calibration(VehicleCalibration, TWIN / "vehicle.yaml")
-    limits = car.limits.model_copy(update={"current_max_a": calibrated_a})
-    assert drive_limits(car.model_copy(update={"limits": limits}), asked_a).current_max_a == limit_a
+    limits = car.limits.model_copy(update={"current_max_a": 5.0})
+    save_calibration(car.model_copy(update={"limits": limits}), tmp_path / "vehicle.yaml")
+    config = MotorConfig(port="/dev/null", calibration=tmp_path / "vehicle.yaml", brake_current_a=20.0)
+    with pytest.raises(ConfigError, match=r"of at least brake_current_a, 20 A, got 5 A, which would weaken"):
+        MotorNode.build(config, None)
+
+
+@pytest.mark.parametrize("weak", ["brake_current_a: 0.02", "brake_hold_s: 0.0001"])
+def test_a_stop_that_would_not_brake_is_refused(weak):
+    text = f"port: /dev/null\ncalibration: {TWIN / 'vehicle.yaml'}\n{weak}\n"
+    with pytest.raises(ConfigError, match=rf"{weak.split(':')[0]}: .* greater than or equal to"):
+        validate(MotorConfig, parse_yaml(text, "motor.yaml"))

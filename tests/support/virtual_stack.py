@@ -14,7 +14,7 @@ from hardware.motor.vesc import Vesc
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.control.arming_gates import ClockGate, HandGate
-from nodes.motor import MotorConfig, MotorNode, drive_limits
+from nodes.motor import MotorConfig, MotorNode
 from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.clock import Now
 from nodes.runtime.messages import camera_info_message, drive_message, header, pose_message, types
@@ -118,9 +118,7 @@ class VirtualStack:
         motor = MotorConfig(port="memory", calibration=VEHICLE, steering_check="never")
 
         def make() -> Vesc:
-            vesc = _WiredVesc(
-                "memory", vehicle.vehicle_gains, drive_limits(vehicle, None), motor.brake_current_a
-            )
+            vesc = _WiredVesc("memory", vehicle.vehicle_gains, vehicle.drive_limits, motor.brake_current_a)
             vesc.stack = self
             return vesc
 

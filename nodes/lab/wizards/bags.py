@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.csv_rows import read_csv
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.image_files import read_stored
+from advnerf_core.data.image_files import natural_order, read_stored
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.errors import ConfigError, MissingFileError
 from advnerf_core.geometry import Array
@@ -82,7 +82,8 @@ def read_frames(bag: Path) -> Iterator[tuple[int, Rgb]]:
 def read_pictures(source: Path) -> Iterator[tuple[str, Rgb]]:
     """Yield name and image of every file of a folder, or of every frame of a bag."""
     if source.is_dir() and not holds_bag(source):
-        files = sorted(file for file in source.iterdir() if file.suffix.lower() in PICTURES)
+        found = (file for file in source.glob("[!.]*") if file.suffix.lower() in PICTURES)
+        files = sorted(found, key=lambda file: natural_order(file.name))
         if not files:
             raise CalibrationError(
                 f"expected a bag, or a folder of pictures ({', '.join(PICTURES)}), got {source}"
