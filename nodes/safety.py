@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 
 from advnerf_core.strict import LagS, LengthM, RightAngleRad, SpeedMps, StrictModel
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
+from hardware.cameras.interface import RECORDED
 from nodes.control.arming import Arming, ArmingLimits
 from nodes.control.arming_gates import ClockGate, HandGate
 from nodes.control.arming_requests import ArmRequests
@@ -78,7 +79,7 @@ class SafetyConfig(StrictModel):
 
     room: Path
     vehicle: Path
-    nodes: tuple[str, ...] = ("camera", "vicon", "compositor", "policy", "motor")
+    nodes: tuple[str, ...] = Field(default=("camera", "vicon", "compositor", "policy", "motor"), min_length=1)
     drivers: tuple[Literal["expert", "policy"], ...] = Field(default=("policy",), min_length=1)
     teleop: Literal["none", "hold"] = "none"
     teleop_age_limit_s: float = Field(default=0.2, gt=0.05, le=0.25)
@@ -208,8 +209,13 @@ class SafetyNode(Node):
             arming.heard_motor(info)
             self._stall.motor(float(message.speed_mps), now.mono_ns)
         elif topic.startswith(STATUS_PREFIX):
+            counters = dict(zip(message.counter_names, message.counter_values, strict=False))
             arming.heard_status(
-                topic.removeprefix(STATUS_PREFIX), str(message.state), str(message.text), info
+                topic.removeprefix(STATUS_PREFIX),
+                str(message.state),
+                str(message.text),
+                info,
+                recorded=bool(counters.get(RECORDED)),
             )
         arming.check(now.mono_ns)
         return self._news(now)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ipaddress
 import time
+from typing import Annotated
 
 from pydantic import Field, field_validator
 
-from advnerf_core.strict import StrictModel
+from advnerf_core.strict import StrictModel, at_most
 from hardware.mocap.library import LibraryConfig, LibraryReceiver
 from hardware.mocap.vicon import DEFAULT_PORT, SubjectPose, ViconConfig, ViconReceiver
 from nodes.runtime.clock import NS_PER_S
@@ -53,10 +55,18 @@ class ViconNodeConfig(StrictModel):
     library: str | None = None
     hostname: str = "localhost"
     subjects: tuple[str, ...] = Field(default=("car", "board", "monitor"), min_length=1)
-    latency_s: float = 0.0
-    frozen_frames: int = Field(default=5, ge=2)
+    latency_s: Annotated[float, at_most(1.0, "s", "ms")] = Field(default=0.0, ge=0.0)
+    frozen_frames: int = Field(default=5, ge=2, le=50)
     max_age_s: float = Field(default=0.1, gt=0.0)
     silence_s: float = Field(default=0.5, gt=0.0)
+
+    @field_validator("source")
+    @classmethod
+    def _an_address(cls, source: str | None) -> str | None:
+        try:
+            return None if source is None else str(ipaddress.IPv4Address(source))
+        except ValueError:
+            raise ValueError("expected an IPv4 address, as datagrams have no names of computers") from None
 
     @field_validator("subjects")
     @classmethod
@@ -122,7 +132,7 @@ class ViconNode(Node):
         if first not in self._seen_ns:
             return (
                 STARTING,
-                text if self._receiver.counts.datagrams else f"no datagrams on {self._receiver.source}",
+                text if self._receiver.counts.datagrams else self._receiver.silence,
             )
         return (FAULT if first in lost else ACTIVE), text
 
@@ -132,6 +142,7 @@ class ViconNode(Node):
         totals: dict[str, float] = {
             "datagrams": counts.datagrams,
             "refused": counts.refused,
+            "from_elsewhere": counts.elsewhere,
             "late": counts.late,
             "stale": self._stale,
             "frames_missed": counts.missed_frames,

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Pinhole
 
+RECORDED = "recorded"
+"""Counter of a camera whose frames are recorded: the safety node lets only the simulated car drive by them."""
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -52,5 +55,5 @@ class Camera(Protocol):
         return None
 
     def counters(self) -> dict[str, float]:
-        """Error counters of frames by name, kept across `open` and `close`."""
+        """Error counters of frames by name, kept across `open` and `close`; and `RECORDED` where they are no view of now."""
         return {}

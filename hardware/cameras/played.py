@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hardware.cameras.interface import Camera, Frame
+from hardware.cameras.interface import RECORDED, Camera, Frame
 from hardware.errors import LinkLost
 
 
@@ -43,6 +43,10 @@ class PlayedCamera(Camera):
         # Scheduled from the current time, so that images are never delivered in a burst.
         self._next_s = max(self._next_s + self._period_s, time.monotonic())
         return frame
+
+    def counters(self) -> dict[str, float]:
+        """Say that the frames are recorded: their stamps are of now, and a real car must not drive by them."""
+        return {RECORDED: 1.0}
 
     def close(self) -> None:
         """Close the camera."""

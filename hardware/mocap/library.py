@@ -75,6 +75,11 @@ class LibraryReceiver:
         """Description of the source of poses."""
         return f"{self.config.system} at {self.config.hostname}"
 
+    @property
+    def silence(self) -> str:
+        """What is missing while there are no frames."""
+        return f"no datagrams on {self.source}"
+
     def fault(self, mono_ns: int) -> str:
         """Always empty, because the library receives from one system and numbers its frames."""
         del mono_ns

@@ -78,9 +78,11 @@ class ViconConfig:
 
 @dataclass
 class ViconCounts:
-    """Counts of datagrams and poses."""
+    """Counts of datagrams and poses. ``elsewhere`` are datagrams from other addresses than the configured one, the last of them `stranger`."""
 
     datagrams: int = 0
+    elsewhere: int = 0
+    stranger: str = ""
     refused: int = 0
     late: int = 0
     missed_frames: int = 0
@@ -194,9 +196,12 @@ class ViconReceiver:
         return self._tracker.counts
 
     @property
-    def source(self) -> str:
-        """Description of the source of poses."""
-        return f"UDP port {self.port}"
+    def silence(self) -> str:
+        """What is missing while there are no datagrams."""
+        wanted = f"no datagrams on UDP port {self.port}"
+        if not self.counts.elsewhere:
+            return wanted
+        return f"{wanted} from {self.config.source}, but {self.counts.elsewhere} from {self.counts.stranger}; correct source"
 
     def fault(self, mono_ns: int) -> str:
         """Describe which subjects are currently unreliable, and why; empty if none. Any thread."""
@@ -214,6 +219,9 @@ class ViconReceiver:
                 break
             if self.config.source in (None, address[0]):
                 poses += self._tracker.update(data, *_arrival(ancillary), address)
+            else:
+                self.counts.elsewhere += 1
+                self.counts.stranger = address[0]
         return poses
 
     def close(self) -> None:

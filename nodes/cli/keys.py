@@ -36,22 +36,17 @@ def keys_new(name: Name, folder: Folder = None) -> None:
 def keys_allow(
     name: Name,
     right: Annotated[
-        str, typer.Option("--right", help="Right to grant: watch, or drive (which includes watch).")
+        str, typer.Option("--right", help="Its right: to watch alone, or to drive (which includes watching).")
     ] = "watch",
     public: Annotated[str | None, typer.Option(help="Public key, if this host does not have it yet.")] = None,
     folder: Folder = None,
 ) -> None:
     """Allow a key to watch or to drive. A running launch accepts the key at its next connection attempt."""
-    from nodes.linking.keys import RIGHTS
-    from nodes.runtime.errors import SecurityError
-
-    if right not in RIGHTS:
-        raise SecurityError(f"--right: expected {' or '.join(RIGHTS)}; got {right}")
     keys = _folder(folder)
     if public is not None:
         keys.add(name, public)
-    keys.allow(name, right)
-    print(f"{name} may {right}")
+    lost = keys.allow(name, right)
+    print(f"{name} may {right}" + f", and no longer {' or '.join(lost)}" * bool(lost))
 
 
 @app.command("add")

@@ -91,6 +91,7 @@ class _Driver(_Source):
 class _NodeStatus(_Source):
     state: str = ""
     text: str = ""
+    recorded: bool = False
 
 
 @dataclass
@@ -148,12 +149,14 @@ class Arming:
         """Note telemetry of the motor node."""
         self._motor.heard(info)
 
-    def heard_status(self, name: str, state: str, text: str, info: MessageInfo) -> None:
-        """Note the status of a node."""
+    def heard_status(
+        self, name: str, state: str, text: str, info: MessageInfo, recorded: bool = False
+    ) -> None:
+        """Note the status of a node, and whether it plays a recording."""
         if name in self._nodes:
             node = self._nodes[name]
             node.heard(info)
-            node.state, node.text = state, text
+            node.state, node.text, node.recorded = state, text, recorded
 
     def heard_drive(
         self,
@@ -373,6 +376,11 @@ class Arming:
             )
         if node.state not in _ALIVE_STATES:
             return f"node {name} is in state {node.state}: {node.text}"
+        if node.recorded and not is_twin(self.peer):
+            return (
+                f"node {name} plays a recording, by which the simulated car alone may drive; the motor's peer is {self.peer or 'unknown'}, "
+                "not the twin"
+            )
         return ""
 
     def _command_fault(self, speed_mps: float, steering_rad: float) -> str:

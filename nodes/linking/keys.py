@@ -79,7 +79,9 @@ class KeyFolder:
         return public
 
     def add(self, name: str, public: str) -> None:
-        """Store the public key of another host. A different key under a known name is refused."""
+        """Store the public key of another host. A different key under a known name is refused, and so is a known key under another name: its rights
+        are those of the key, and revoking one name would leave it the other's.
+        """
         known = self._file("public", name)
         if not _KEY.fullmatch(public):
             raise SecurityError(f"expected a public key of 40 Z85 characters for {name}, got {public!r:.60}")
@@ -87,16 +89,25 @@ class KeyFolder:
             raise SecurityError(
                 f"{name} has another key in {known}; revoke {name} and remove that file first"
             )
+        if other := next(
+            (row.name for row in self.rows() if row.public == public and row.name != name), None
+        ):
+            raise SecurityError(f"this public key is known as {other}; allow or revoke {other}")
         write_atomically(known, public + "\n")
 
-    def allow(self, name: str, right: str) -> None:
-        """Add a known key to a list. The right to drive includes the right to watch."""
+    def allow(self, name: str, right: str) -> tuple[str, ...]:
+        """Give a known key a right: to drive, which includes to watch, or to watch alone. Returns the rights that it had and loses."""
+        _require_right(right)
         public = self.public(name)
+        lost = self.revoke(name, DRIVE) if right == WATCH and self._file(DRIVE, name).exists() else ()
         for granted in RIGHTS if right == DRIVE else (right,):
             write_atomically(self._file(granted, name), public + "\n")
+        return lost
 
     def revoke(self, name: str, right: str | None = None) -> tuple[str, ...]:
         """Remove a key from the drive list, or from both lists if the right is watch or None. Returns the revoked rights."""
+        if right is not None:
+            _require_right(right)
         taken = []
         for lost in (DRIVE,) if right == DRIVE else RIGHTS:
             file = self._file(lost, name)
@@ -194,6 +205,11 @@ def require_keys(address: str, keys: KeyFolder | None, commands: Sequence[str] =
             f"without keys a link can only be used to watch, but this one would carry {shown} to the listening host, so any process on "
             f"{address} could drive the car. {_MAKE_KEYS}; or run all nodes on one computer with --host all"
         )
+
+
+def _require_right(right: str) -> None:
+    if right not in RIGHTS:
+        raise SecurityError(f"expected the right {' or '.join(RIGHTS)}, got {right}")
 
 
 def _read_key(file: Path) -> str:

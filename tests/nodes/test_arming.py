@@ -28,6 +28,7 @@ class World:
         self.instances = {}
         self.silent = set()
         self.states = dict.fromkeys(NODES, "active")
+        self.recorded = False
         self.xy = (0.0, 0.0)
         self.command = (0.8, 0.1)
         self.capture_frozen_at = None
@@ -59,7 +60,8 @@ class World:
             if self.ms % 200 == 0:
                 for name in NODES:
                     if name not in self.silent:
-                        self.arming.heard_status(name, self.states[name], "text", self.info(name))
+                        recorded = self.recorded and name == "camera"
+                        self.arming.heard_status(name, self.states[name], "text", self.info(name), recorded)
             if self.ms % 40 == 0 and "motor" not in self.silent:
                 self.arming.heard_motor(self.info("motor"))
             if self.ms % 20 == 0:
@@ -93,6 +95,22 @@ def time_to_disarm(world, limit_ms=3000):
     while world.arming.armed and world.ms - start < limit_ms:
         world.run(10)
     return world.ms - start
+
+
+def test_a_camera_that_plays_a_recording_drives_the_simulated_car_alone(world):
+    """Its frames are stamped when they are delivered, so that no age gives them away."""
+    world.recorded = True
+    world.run(500)
+    assert world.arm()
+    world.arming.peer = "60_MK6 firmware 5.02"
+    assert time_to_disarm(world) <= 20
+    said = "node camera plays a recording, by which the simulated car alone may drive; the motor's peer is 60_MK6 firmware 5.02, not the twin"
+    assert world.arming.reason == said
+    assert not world.arm()
+    assert world.refusal == said
+    world.recorded = False
+    world.run(500)
+    assert world.arm()
 
 
 def test_nothing_passes_before_somebody_arms(world):

@@ -3,20 +3,23 @@
 import re
 import socket
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from advnerf_core.documents import Document
 from advnerf_core.geometry import planar_pose
+from advnerf_core.strict import validate
 from calibration.schema import CalibrationError, CameraCalibration, load_calibration
 from hardware.cameras.interface import Frame
 from hardware.emulators.frame_server import FrameServer
 from hardware.mocap.vicon_codec import encode_blocks, object_pose
 from nodes.camera import CameraNode, CameraNodeConfig
 from nodes.runtime.clock import SystemClock
-from nodes.runtime.errors import RuntimeFault
+from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.messages import ns_from_stamp, pose_matrix
 from nodes.runtime.pictures import rgb_image
 from nodes.vicon import ViconNode, ViconNodeConfig
@@ -159,6 +162,22 @@ def test_vicon_one_topic_for_each_subject(vicon, tracker):
     np.testing.assert_allclose(pose_matrix(out.message), planar_pose(0.5, -0.2, 0.7), atol=1e-9)
     assert abs(ns_from_stamp(out.message.header.stamp) - CLOCK.now().real_ns) < 1e9
     assert vicon.status() == ("active", "not seen: board")
+
+
+def test_vicon_names_a_sender_that_it_was_not_told_of(tracker, node_context):
+    with closing(ViconNode.build(ViconNodeConfig(port=0, source="127.0.0.9"), node_context)) as vicon:
+        send_pose(tracker, vicon, 1, "car", planar_pose(0.5, -0.2, 0.7))
+        wait_for(lambda: vicon.counters()["from_elsewhere"], "the datagram")
+        state, text = vicon.status()
+        assert state == "starting"
+        assert text.startswith(f"no datagrams on UDP port {vicon.port} from 127.0.0.9, but ")
+        assert text.endswith(" from 127.0.0.1; correct source")
+
+
+@pytest.mark.parametrize("wrong", ["tracker-pc", "192.168.1.300", "127.0.0.1 "])
+def test_vicon_refuses_a_source_that_no_datagram_has(wrong):
+    with pytest.raises(ConfigError, match="source: expected an IPv4 address"):
+        validate(ViconNodeConfig, Document({"source": wrong}, "vicon.yaml"))
 
 
 def test_vicon_that_loses_the_car_reports_a_fault(vicon, tracker):

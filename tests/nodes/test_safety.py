@@ -104,6 +104,31 @@ def test_safety_says_stop_25_times_a_second_until_armed():
     assert guard.node.status() == ("ready", "disarmed: not armed since the start")
 
 
+def test_safety_hears_from_its_counters_that_the_camera_plays_a_recording():
+    guard = Guard()
+    guard.everything()
+    assert states_of(guard.arm()) == [True]
+    played = filled(
+        types.NodeStatus,
+        header=header(guard.now.real_ns),
+        node="camera",
+        pid=1,
+        state="active",
+        counter_names=["frames_missed", "recorded"],
+        counter_values=np.array([0.0, 1.0]),
+    )
+    guard.say("/status/camera", played)
+    assert guard.node.status() == ("active", "armed by trial")
+    guard.say(
+        "/motor/sent",
+        filled(types.MotorSent, header=header(guard.now.real_ns), servo=0.5, peer="60_MK6 5.02"),
+    )
+    state, text = guard.node.status()
+    guard.node.tick(guard.now)
+    state, text = guard.node.status()
+    assert (state, text[:42]) == ("ready", "disarmed: node camera plays a recording, b")
+
+
 def test_safety_passes_commands_with_their_stamp_only_while_armed():
     guard = Guard()
     assert drives_of(guard.everything()) == []

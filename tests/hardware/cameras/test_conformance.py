@@ -3,10 +3,12 @@
 import itertools
 import time
 
+import cv2
 import numpy as np
 import pytest
 
-from hardware.cameras.interface import Camera
+from hardware.cameras.file import FileCamera
+from hardware.cameras.interface import RECORDED, Camera
 from hardware.cameras.steady import SteadyCamera
 from hardware.errors import DeviceNotFound, LinkLost
 from nodes.lab.camera_check import CHECKS, CameraBench
@@ -202,3 +204,14 @@ def test_picture_that_repeats_itself_is_a_stall(tmp_path):
     assert [frame is None for frame in got] == [False, False, False, True]
     assert "repeats one image (4 identical frames)" in camera.error
     rig.close()
+
+
+def test_pictures_are_played_in_the_order_of_their_numbers_without_hidden_files(tmp_path):
+    """As another program numbers them, and as macOS copies them to a foreign disk."""
+    for number in range(1, 13):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((4, 6, 3), 10 * number, np.uint8))
+        (tmp_path / f"._{number}.png").write_bytes(b"resource fork")
+    camera = FileCamera(tmp_path, rate_hz=1000.0, loop=False)
+    camera.open()
+    assert [int(camera.read(5.0).rgb[0, 0, 0]) // 10 for _ in range(12)] == list(range(1, 13))
+    assert camera.counters()[RECORDED] == 1.0

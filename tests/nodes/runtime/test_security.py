@@ -156,6 +156,15 @@ def test_rights_are_separate_and_can_be_taken_back(tmp_path):
     assert not keys.allowed(DRIVE)
     keys.revoke("alice")
     assert keys.rows()[0].rights == ()
+    keys.allow("alice", DRIVE)
+    assert keys.allow("alice", WATCH) == (DRIVE,)
+    assert (keys.rows()[0].rights, keys.allow("alice", WATCH)) == ((WATCH,), ())
+    for ask in (keys.allow, keys.revoke):
+        with pytest.raises(SecurityError, match="expected the right watch or drive, got drvie"):
+            ask("alice", "drvie")
+    with pytest.raises(SecurityError, match="this public key is known as alice"):
+        keys.add("alice2", public)
+    keys.revoke("alice")
     with pytest.raises(SecurityError, match="has no such right"):
         keys.revoke("alice")
     with pytest.raises(SecurityError, match="expected a public key at"):
