@@ -12,6 +12,7 @@ from pathlib import Path
 
 from advnerf_core.driving.path import Path as DrivingPath
 from calibration.schema import (
+    BY_CONSTRUCTION,
     Calibration,
     CameraCalibration,
     GainsSection,
@@ -25,7 +26,6 @@ from hardware.motor.limits import DriveLimits, VehicleGains
 from hardware.worlds.lab.config import CarConfig, LabConfig, PanelConfig
 from hardware.worlds.lab.lab import FENCE_MARGIN_M, HALF_LANE_M
 
-METHOD = "by construction"
 # The day the default lab got its numbers; the files do not change when they are written again.
 LAB_DATE = datetime.date(2026, 11, 21)
 
@@ -55,7 +55,7 @@ def _camera(lab: LabConfig) -> CameraCalibration:
     pinhole = lab.camera.pinhole
     return CameraCalibration(
         date=LAB_DATE,
-        method=METHOD,
+        method=BY_CONSTRUCTION,
         width=pinhole.width,
         height=pinhole.height,
         fx=pinhole.fx,
@@ -79,7 +79,7 @@ def _vehicle(car: CarConfig) -> VehicleCalibration:
     limits = DriveLimits(steering_min_rad=right, steering_max_rad=left)
     return VehicleCalibration(
         date=LAB_DATE,
-        method=METHOD,
+        method=BY_CONSTRUCTION,
         wheelbase_m=car.wheelbase_m,
         notes="nominal gains, as a careful person would measure them; the simulated car deviates by 2 to 3 %",
         gains=GainsSection(**vars(gains)),
@@ -91,7 +91,9 @@ def _target(subject: str, panel: PanelConfig) -> TargetCalibration:
     y, z = 0.5 * panel.width_m, 0.5 * panel.height_m
     # Facing the panel one looks along its -x with z up, so left is its -y.
     corners = ((0.0, -y, z), (0.0, y, z), (0.0, y, -z), (0.0, -y, -z))
-    return TargetCalibration(date=LAB_DATE, method=METHOD, subject=subject, corners_in_subject_m=corners)
+    return TargetCalibration(
+        date=LAB_DATE, method=BY_CONSTRUCTION, subject=subject, corners_in_subject_m=corners
+    )
 
 
 def _room(lab: LabConfig) -> RoomCalibration:
@@ -100,7 +102,7 @@ def _room(lab: LabConfig) -> RoomCalibration:
     reach = 0.5 * lab.room.side_m - FENCE_MARGIN_M
     return RoomCalibration(
         date=LAB_DATE,
-        method=METHOD,
+        method=BY_CONSTRUCTION,
         path=path.to_dict(),
         off_track_m=HALF_LANE_M,
         start_pose=lab.start_pose,

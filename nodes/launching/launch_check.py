@@ -10,17 +10,20 @@ from pathlib import Path
 from advnerf_core.documents import dump_yaml, parse_json
 from advnerf_core.run_module import module_command
 from nodes.launching.launch_file import Plan
+from nodes.launching.one_car import mixtures
 from nodes.runtime.config import node_document
 
 _TIMEOUT_S = 60.0
 
 
 def check_nodes(plan: Plan) -> dict[str, str]:
-    """Return the configuration errors by node; empty if every node accepts its configuration.
+    """Return the configuration errors by node; empty if every node accepts its configuration, and all are of one car.
 
     Each node's module is run with ``--check``, all in one process: it reads its configuration, prints errors and exits. Files that a
     node reads when it starts, such as a policy or an attack, are not opened.
     """
+    if mixed := mixtures(plan):
+        return mixed
     with tempfile.TemporaryDirectory(prefix="advnerf-check-") as folder:
         asked = []
         for name, entry in plan.nodes.items():

@@ -33,12 +33,14 @@ class Plan:
         launch: The typed content.
         documents: Configuration of each enabled node with the places of its keys, for error messages.
         resolved: The complete launch as plain data, to be stored with the results.
+        run_dir: Value of ``${run_dir}``.
     """
 
     file: Path
     launch: LaunchFile
     documents: dict[str, Document]
     resolved: dict[str, Any]
+    run_dir: str
 
     @property
     def nodes(self) -> dict[str, NodeEntry]:
@@ -84,7 +86,7 @@ def load_launch(
     for name in enabled:
         _check(name, launch.nodes[name], document)
     documents = {name: document.part(("nodes", name, "config")) for name in enabled}
-    return Plan(file, launch, documents, document.data)
+    return Plan(file, launch, documents, document.data, str(run_dir))
 
 
 def _read_with_includes(file: Path, above: tuple[Path, ...]) -> Document:

@@ -1,5 +1,6 @@
 """The shipped launch files: they resolve, and each node of a real car takes the configuration that is meant for it."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from nodes.launching.launch_check import check_nodes
 from nodes.launching.launch_file import load_launch
 from nodes.launching.launched import Launched, read_launched
+from nodes.launching.one_car import mixtures
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.paths import RESOLVED_NAME
 
@@ -80,6 +82,36 @@ def test_the_page_holds_the_button_that_the_safety_node_waits_for():
     plan = load_launch(LAUNCH / "page.launch.yaml")
     assert plan.documents["safety"].data["teleop"] == "hold"
     assert plan.documents["page"].data["host"] == "127.0.0.1"
+
+
+MIXED = {
+    "a real controller beside the twin": (
+        ["motor.port=/dev/vesc"],
+        r"expected motor\.port <run_dir>/vesc beside the node twin, got /dev/vesc: a real car would drive by simulated poses",
+    ),
+    "the simulated car's limits on a real one": (
+        ["twin.if=false", "motor.port=/dev/vesc"],
+        r"expected a measured motor\.calibration for the controller at /dev/vesc, got .*twin/vehicle\.yaml, the simulated car's",
+    ),
+    "two cars": (
+        ["safety.vehicle=other/vehicle.yaml"],
+        r"expected one vehicle file for safety and motor, got other/vehicle\.yaml and .*twin/vehicle\.yaml",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", MIXED)
+def test_parts_of_different_cars_are_refused(what):
+    overrides, told = MIXED[what]
+    (said,) = check_nodes(load_launch(LAUNCH / "green_screen.launch.yaml", overrides)).values()
+    assert re.search(told, said), said
+
+
+def test_a_car_that_was_measured_is_one_car(tmp_path):
+    for file in (LAUNCH.parent / "calibration" / "twin").iterdir():
+        (tmp_path / file.name).write_text(file.read_text().replace("by construction", "measured"))
+    real = ["twin.if=false", "motor.port=/dev/vesc", f"params.calibration={tmp_path}"]
+    assert mixtures(load_launch(LAUNCH / "green_screen.launch.yaml", real)) == {}
 
 
 @pytest.mark.parametrize("file", ["ros2", "ros2_car"])

@@ -154,7 +154,7 @@ def test_each_host_has_its_own_needs(tmp_path):
     assert [row.do for row in rows if row.check == "keys"] == [
         "advnerf car keys allow workstation --right drive"
     ]
-    keys.add("workstation", keys.public("robot"))
+    keys.add("workstation", KeyFolder(tmp_path / "there").new("workstation"))
     keys.allow("workstation", DRIVE)
     with socket.create_server(("127.0.0.1", watch)):
         rows = findings(robot, tmp_path, (*SLOW, "VICON", "camera", "VESC"))

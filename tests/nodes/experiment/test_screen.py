@@ -10,9 +10,9 @@ from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.display import DisplayModel
 from advnerf_core.fields.voxel_grid import face_corners_in_object
 from advnerf_core.geometry import invert_transform, planar_pose, transform_points
-from calibration.by_construction import LAB_DATE, METHOD, twin_calibrations
+from calibration.by_construction import LAB_DATE, twin_calibrations
 from calibration.display_colour import DisplayCalibration
-from calibration.schema import CalibrationError, save_calibration
+from calibration.schema import BY_CONSTRUCTION, CalibrationError, save_calibration
 from hardware.worlds.lab.config import MonitorOpticsConfig
 from hardware.worlds.lab.world import MONITOR_PIXELS
 from nodes.experiment.show import faces, screen
@@ -96,7 +96,7 @@ def test_an_attack_looks_through_the_display_model_where_a_monitor_shows_it_and_
     asked = load_experiment(LAUNCH / f"{file}.experiment.yaml", "demo", changes, tmp_path)
     asked.calibration_folder.mkdir(parents=True)
     save_calibration(
-        DisplayCalibration(date=LAB_DATE, method=METHOD, model=SEEN_AS.to_dict()),
+        DisplayCalibration(date=LAB_DATE, method=BY_CONSTRUCTION, model=SEEN_AS.to_dict()),
         asked.calibration_folder / faces.DISPLAY,
     )
     space = faces.face_space(asked, grey_room)
