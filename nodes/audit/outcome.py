@@ -61,7 +61,7 @@ class Known:
     """All findings of a running audit; None or empty for steps that were not reached."""
 
     question: AuditedQuestion
-    minutes: float
+    minutes: float | None
     file: Path | None = None
     experiment: Experiment | None = None
     fidelity: AuditFidelity | None = None

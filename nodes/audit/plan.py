@@ -25,12 +25,14 @@ class Decided(StrictModel):
 
     Attributes:
         evaluations: Evaluations that the budget buys; None before they were counted.
+        minutes: The budget that bought them, in minutes; None if their number itself was asked for.
         spots: Possible places of the object; None before they were chosen.
         settings: Settings of the experiment file, by name.
     """
 
     question: str
     evaluations: int | None = Field(default=None, ge=1)
+    minutes: float | None = Field(default=None, gt=0.0)
     spots: list[dict[str, Any]] | None = None
     settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
@@ -45,7 +47,7 @@ class AuditPlan:
 
     @classmethod
     def of(cls, folder: Path, question: AuditedQuestion) -> AuditPlan:
-        """The decisions in a folder, or empty ones.
+        """The decisions in a folder, or empty ones: those about another question count only once something was decided.
 
         Raises:
             ConfigError: The folder belongs to another audit.
@@ -57,12 +59,37 @@ class AuditPlan:
         if not file.exists():
             return cls(folder, question, Decided(question=key))
         decided = validate(Decided, Document(read_json(file), str(file)))
+        if decided.question != key and decided == Decided(question=decided.question):
+            return cls(folder, question, Decided(question=key))
         if decided.question != key:
             raise ConfigError(
                 f"expected a folder of this audit or a new one, got {folder}, where another policy, place, lane, car or object was asked about; name "
                 "another one with --output"
             )
         return cls(folder, question, decided)
+
+    def agreed(self, minutes: float | None, evaluations: int | None) -> tuple[float | None, int | None]:
+        """Minutes or evaluations of this audit: as its searches were planned, or as asked now.
+
+        Raises:
+            ConfigError: Its searches were planned with another budget than is asked for.
+        """
+        planned = self.decided.minutes, self.decided.evaluations
+        if planned[1] is None:
+            return minutes, evaluations
+        if (minutes is not None and minutes != planned[0]) or (
+            evaluations is not None and (planned[0] is not None or evaluations != planned[1])
+        ):
+            bought = (
+                f"{planned[1]} evaluations"
+                if planned[0] is None
+                else f"{planned[0]:g} min ({planned[1]} evaluations)"
+            )
+            raise ConfigError(
+                f"expected the budget that the searches in {self.folder} were planned with, {bought}; leave --budget and --evaluations out to go on "
+                "with it, or name another folder with --output"
+            )
+        return planned[0], planned[1]
 
     @property
     def spots(self) -> list[Spot] | None:

@@ -58,7 +58,7 @@ _LEAVES_AT_MOST = 0.25
 _PLANTED_SHARE = 1.0
 # Settings with the plain object at the first spot, and at its place in an earlier audit; and the budget of an audit in continuous integration.
 _FIRST, _BEFORE = "first", "before"
-CI_EVALUATIONS = 80
+CI_EVALUATIONS, USUAL_MIN = 80, 15.0
 _JUDGING = {"surrogate": "judging in the learned place", "world": "judging in the world"}
 _OVER = 1.1
 Say = Callable[[str], None]
@@ -79,7 +79,7 @@ class Audit:
     Attributes:
         say: Callback for messages.
         console: Console for progress.
-        minutes: Time for the whole audit; converted once into evaluations.
+        minutes: Time for the whole audit; converted once into evaluations. None for `USUAL_MIN`, or that of an audit that is resumed.
         evaluations: Number of evaluations, instead of the time.
         against: Result of an earlier audit to compare this policy with.
         harden: Whether to export frames for hardening.
@@ -92,7 +92,7 @@ class Audit:
     folder: Path
     say: Say
     console: Console
-    minutes: float
+    minutes: float | None
     evaluations: int | None
     against: Path | None
     harden: bool
@@ -127,6 +127,8 @@ class Audit:
 
     def _run(self, known: Known) -> None:
         plan = AuditPlan.of(self.folder, self.question)
+        self.minutes, self.evaluations = plan.agreed(self.minutes, self.evaluations)
+        known.minutes = self.minutes if self.evaluations is not None else self.minutes or USUAL_MIN
         copies = Copies.of(plan.save(), self.question)
         experiments = copies.learn(self.console)
         experiment = experiments[0]
@@ -212,15 +214,16 @@ class Audit:
             self.cluster,
         )
         if plan.decided.evaluations is None:
-            if self.evaluations is None:
-                searches.evaluations = self._bought(copies.ready(_FIRST), searches)
-            plan.decide(evaluations=searches.evaluations)
+            minutes = None if self.evaluations is not None else self.minutes or USUAL_MIN
+            if minutes is not None:
+                searches.evaluations = self._bought(copies.ready(_FIRST), searches, minutes)
+            plan.decide(evaluations=searches.evaluations, minutes=minutes)
         self.say(f"searching {searches.cost} evaluations")
         return searches
 
-    def _bought(self, experiment: Experiment, searches: Searches) -> int:
+    def _bought(self, experiment: Experiment, searches: Searches, minutes: float) -> int:
         """The evaluations that the rest of the budget buys; at least those of the smallest schedule."""
-        question, minutes = self.question, self.minutes
+        question = self.question
         costs = Costs.measured(experiment, question, searches.differentiable)
         judging_s, used_s = costs.judging_s(question), time.monotonic() - self.began_s
         count = sum(map(len, searches.planned))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.unit_bounds import MOST_LENGTH_M, MOST_SPEED_MPS
 from nodes.cli.endings import INTERRUPTED, text_for_people
 from nodes.lab.importing.metric_options import MetricOptions
@@ -127,13 +128,14 @@ class SearchOptions:
         ),
     ] = None
     budget: Annotated[
-        str,
+        str | None,
         _option(
             _SEARCH,
             "--budget",
             help="Time for the whole audit, as 90s, 10m or 2h; a smallest schedule is always finished.",
+            show_default="15m",
         ),
-    ] = "15m"
+    ] = None
     evaluations: Annotated[
         int | None,
         _option(
@@ -203,7 +205,9 @@ def _print_schema(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _minutes(text: str) -> float:
+def _minutes(text: str | None) -> float | None:
+    if text is None:
+        return None
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
     if found is None or float(found[1]) <= 0.0:
         raise ConfigError(f"--budget: expected a time such as 90s, 10m or 2h, got {text!r}")
@@ -224,6 +228,32 @@ def _limit_m(options: PlaceOptions) -> float | None:
             f"--limit: expected metres above 0 and at most {MOST_LENGTH_M:g}, not cm or mm, or {OFF_LANE} with a world, which declares its lanes, got {text!r}"
         )
     return value
+
+
+def _refuse_unused(
+    place: PlaceOptions, metric: MetricOptions, search: SearchOptions, result: ResultOptions
+) -> None:
+    """Raise for options that would have no effect beside others."""
+    if search.budget is not None and (search.evaluations is not None or result.ci):
+        other = (
+            "--evaluations"
+            if search.evaluations is not None
+            else "--ci, whose number of evaluations is fixed"
+        )
+        raise ConfigError(f"expected one budget, got --budget and {other}; leave one out")
+    if place.world is None:
+        return
+    given = {
+        "--car": place.car is not None,
+        "--speed": place.speed_mps is not None,
+        "--camera-height": place.camera_height_m is not None,
+        "--in-metres": place.in_metres,
+        "--length, --positions, --marker, --dictionary or --up": metric != MetricOptions(),
+    }
+    if unused := [name for name, is_given in given.items() if is_given]:
+        raise ConfigError(
+            f"expected {', '.join(unused)} only with --place: a world has a car, a camera and metres of its own; change them with --set world.KEY=VALUE"
+        )
 
 
 def _say(text: str) -> None:
@@ -293,6 +323,7 @@ def _audit(
 ) -> Audit:
     # What is wrong in the command is told before seconds of imports.
     wanted_m, minutes = _limit_m(place), _minutes(search.budget)
+    _refuse_unused(place, metric, search, result)
     if search.kind != "panel" and not Path(search.kind).is_file():
         raise ConfigError(
             f"--object: expected panel, or a .glb or .object.safetensors file, got {search.kind}, which is not there"
@@ -357,6 +388,14 @@ def _audit(
 
 class AuditCommand(TyperCommand):
     """The command with exit code 64 for wrong options, as 2 is a verdict."""
+
+    def invoke(self, *given: Any) -> Any:
+        """As typer's; options that contradict each other are told here, when they are put together."""
+        try:
+            return super().invoke(*given)
+        except AdvnerfError as error:
+            say_error(str(error))
+            raise typer.Exit(USAGE_EXIT) from None
 
     def make_context(self, *given: Any, **settings: Any) -> Any:
         """As typer's; only the exit code is another."""

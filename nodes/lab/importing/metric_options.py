@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -54,6 +55,10 @@ class MetricOptions:
         if len(given) > 1:
             raise ImportRecordingError(
                 f"expected one source of the scale, got {' and '.join(given)}; give one of them"
+            )
+        if self.length is not None and not 0.0 < self.length[2] < math.inf:
+            raise ImportRecordingError(
+                f"expected --length A B METRES with a length above 0 m, got {self.length[2]:g}; correct it"
             )
         if self.marker_m is None and self.dictionary != MetricOptions.dictionary:
             raise ImportRecordingError(

@@ -2,12 +2,15 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.geometry import Pinhole, camera_mount, planar_pose
@@ -18,8 +21,11 @@ from hardware.worlds.lab.lab import Lab
 from nodes.audit.cars import CARS, car_of
 from nodes.audit.images import posed
 from nodes.audit.places import Answers, AuditedWorld, place_of_photographs
+from nodes.audit.plan import AuditPlan
 from nodes.audit.policies import resolve_policy
+from nodes.audit.question import AuditedQuestion, Place
 from nodes.cli.audit import PlaceOptions, _limit_m, _minutes
+from nodes.cli.main import app
 from nodes.experiment.show.experiment_world import as_json
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.errors import ConfigError
@@ -163,3 +169,56 @@ def test_a_world_with_an_experiment_file_is_driven_along_the_path_of_that_file()
     """Duckietown's first path by name turns left, and its experiment drives right."""
     assert AuditedWorld("duckietown").place(None).path == "right"
     assert AuditedWorld("duckietown").place("left").path == "left"
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (
+            "--world lab --car donkey --speed 2",
+            "expected --car, --speed only with --place: a world has a car",
+        ),
+        (
+            "--world lab --in-metres --up ground",
+            "expected --in-metres, --length, .* or --up only with --place",
+        ),
+        ("--world lab --evaluations 5 --budget 2h", "expected one budget, got --budget and --evaluations"),
+        ("--world lab --ci --budget 2h", "expected one budget, got --budget and --ci"),
+        (
+            "--world lab --length a b 4 --marker 0.2",
+            "expected one source of the scale, got --length and --marker",
+        ),
+        ("--place . --length a b -4", "with a length above 0 m, got -4"),
+        ("--place . --length a b nan", "expected finite numbers for --length"),
+    ],
+)
+def test_options_without_effect_and_contradictions_are_refused_with_the_code_of_usage(
+    options: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = CliRunner().invoke(app, ["audit", "mine.onnx", *options.split()])
+    assert found.exit_code == 64
+    assert re.search(told, " ".join((found.output + found.stderr).split()))
+
+
+def test_a_folder_keeps_the_budget_of_its_searches_and_no_refused_question(tmp_path: Path) -> None:
+    question = AuditedQuestion(
+        "file.onnx", "file.onnx", Place("lab", "world", "lab", "world", {"kind": "lab"}), 0.4, judging=20
+    )
+    other = replace(question, size_m=0.5)
+    AuditPlan.of(tmp_path, question).save()
+    plan = AuditPlan.of(tmp_path, other)  # of the first nothing was decided, as its world was misspelt
+    assert plan.agreed(120.0, None) == (120.0, None)
+    plan.decide(evaluations=60, minutes=15.0)
+    again = AuditPlan.of(tmp_path, other)
+    assert again.agreed(None, None) == again.agreed(15.0, None) == (15.0, 60)
+    for asked in ((120.0, None), (None, 60)):
+        with pytest.raises(
+            ConfigError, match=r"were planned with, 15 min \(60 evaluations\); leave --budget"
+        ):
+            again.agreed(*asked)
+    again.decide(evaluations=60, minutes=None)
+    assert again.agreed(None, 60) == (None, 60)
+    with pytest.raises(ConfigError, match=r"were planned with, 60 evaluations;"):
+        again.agreed(15.0, None)
+    with pytest.raises(ConfigError, match="where another policy, place, lane, car or object was asked about"):
+        AuditPlan.of(tmp_path, question)
