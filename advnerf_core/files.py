@@ -67,6 +67,11 @@ def refuse_overwriting(inputs: Iterable[Path | None], outputs: Iterable[Path]) -
         taken.add(file)
 
 
+def is_plain_name(name: str) -> bool:
+    """Whether a name is that of a file alone, on any system, so that a stranger's file cannot have others written elsewhere."""
+    return name not in ("", ".", "..") and not any(each in name for each in "/\\\0")
+
+
 def write_json(path: Path, data: Any) -> None:
     """Write an indented JSON value, whole or not at all."""
     write_atomically(path, json.dumps(data, indent=1) + "\n")

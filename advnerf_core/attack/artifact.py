@@ -22,7 +22,7 @@ from safetensors.numpy import load
 
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import read_tensors, write_tensors
+from advnerf_core.files import is_plain_name, read_tensors, write_tensors
 from advnerf_core.geometry import Array, Pinhole, yaw_of
 
 FILE_FORMAT = "advnerf-attack-2"
@@ -72,6 +72,12 @@ class AttackedObject:
         return float(T[0, 3]), float(T[1, 3]), yaw_of(T), float(self.scale)
 
     def __post_init__(self) -> None:
+        if not is_plain_name(self.name):
+            raise AttackFileError(
+                f"expected a name of an object without slashes, as files are called by it, got {self.name!r:.80}"
+            )
+        if self.glb and not self.glb.startswith(b"glTF"):
+            raise AttackFileError(f"expected the mesh of {self.name} to be a GLB file, got something else")
         if self.theta.ndim < 2 or self.theta.shape[-1] != 3 or self.theta.dtype != np.float32:
             raise AttackFileError(
                 f"expected theta [..., 3] float32, got {self.theta.shape} {self.theta.dtype}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -65,6 +65,13 @@ class Picture:
     edited: Callable[[], tuple[NDArray[np.uint8], Pinhole]] | None = None
     mask: Path | None = None
     split: str | None = None
+
+    def __post_init__(self) -> None:
+        """Raise for a name by which a file outside the data set would be written."""
+        if ".." in PurePosixPath(self.name).parts or (self.mask is not None and self.name.startswith("/")):
+            raise ScanError(
+                f"expected images inside the folder of the scan, got one called {self.name!r:.120}; put it there, and correct its name in the scan"
+            )
 
 
 @dataclass(frozen=True, eq=False)

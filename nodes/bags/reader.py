@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mcap.records import Channel
 
-from advnerf_core.files import write_atomically
+from advnerf_core.files import is_plain_name, write_atomically
 from nodes.bags.check import diagnose
 from nodes.bags.chunks import messages_in_order, read_attachment_at, read_metadata_at, time_spans
 from nodes.bags.file import open_bag
@@ -120,7 +120,7 @@ def extract_attachments(bag: Path, folder: Path, names: Sequence[str] = ()) -> l
 
 def plain_name(bag: Path, name: str) -> str:
     """Check that the name of an attachment is a plain file name, so that a foreign bag cannot write to other folders."""
-    if name in ("", ".", "..") or Path(name).name != name or "\0" in name:
+    if not is_plain_name(name):
         raise BagError(
             f"{bag}: expected attachments with plain file names, got {name!r}; it is not extracted"
         )

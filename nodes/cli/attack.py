@@ -61,7 +61,7 @@ def attack_show(
 ) -> None:
     """Say what an attack file holds; write the face's texture as PNG and found meshes as GLB."""
     from advnerf_core.attack.artifact import load_attack
-    from nodes.experiment.node.printed import export_attack
+    from nodes.experiment.node.printed import export_attack, stem_of
 
     attack = load_attack(file)
     total, clean, face = attack.predicted_total_cte_m, attack.clean_drive, attack.face
@@ -97,7 +97,7 @@ def attack_show(
     }.items():
         rows.add_row(name, str(value))
     print_table(rows)
-    things = table("object", "searched values", "x [m]", "y [m]", "z [m]", "yaw [rad]", "scale")
+    things = table("object", "searched values", "x [m]", "y [m]", "z of its origin [m]", "yaw [rad]", "scale")
     for each in attack.objects:
         x_m, y_m, yaw_rad, scale = each.placement
         place = (x_m, y_m, float(each.T_world_from_object[2, 3]), yaw_rad, scale)
@@ -107,7 +107,7 @@ def attack_show(
     print_table(things)
     if clean is not None and clean.warning:
         print(clean.warning)
-    for path in export_attack(attack, output or file.parent, file.name.partition(".")[0]):
+    for path in export_attack(attack, output or file.parent, stem_of(file)):
         print(f"written: {path}")
 
 

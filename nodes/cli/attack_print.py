@@ -61,12 +61,12 @@ def attack_print(
     from advnerf_core.attack.printing.poster import poster_of
     from advnerf_core.attack.printing.record import save_record
     from advnerf_core.files import refuse_overwriting
-    from nodes.experiment.node.printed import record_beside, write_poster
+    from nodes.experiment.node.printed import record_beside, stem_of, write_poster
 
     poster = poster_of(load_attack(file), name, size_m)
     if markers:
         poster = poster.with_markers(None if marker_mm is None else marker_mm / 1000.0)
-    target = output or file.with_name(f"{file.name.partition('.')[0]}.poster.pdf")
+    target = output or file.with_name(f"{stem_of(file)}.poster.pdf")
     refuse_overwriting((file,), (target,))
     beside = record_beside(poster, file, target, dpi) if markers else None
     print(write_poster(poster, target, paper, dpi, margin_mm, overlap_mm))

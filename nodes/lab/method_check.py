@@ -112,7 +112,12 @@ class MethodBench:
                 raise _Stopped
 
         run = SearchRun(seed, self.folder / state if state else None, tell, settings_hash)
-        return self.method.search(problem or _problem(), self.settings, run), told
+        found: object = self.method.search(problem or _problem(), self.settings, run)
+        if not isinstance(found, SearchResult):
+            raise NotMet(
+                f"expected search to return a SearchResult, got {type(found).__name__}; return the state's result()"
+            )
+        return found, told
 
 
 def keeps_to_its_budget(bench: MethodBench) -> str:

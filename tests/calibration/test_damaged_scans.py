@@ -10,7 +10,7 @@ import pytest
 
 from advnerf_core.errors import AdvnerfError
 from calibration.scans.reading import read_scan
-from calibration.scans.scan import ScanOptions
+from calibration.scans.scan import Picture, ScanError, ScanOptions
 from tests.support import scan_samples
 from tests.support.damaged_bytes import mutate
 from tests.support.scan_damage import ScanFiles
@@ -220,3 +220,11 @@ def test_a_folder_of_no_format_names_all(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
     with pytest.raises(AdvnerfError, match=r"Polycam \(keyframes.*TUM .*, got a\.png; .*scene from-images"):
         read_scan(tmp_path, ScanOptions())
+
+
+def test_an_image_outside_the_scan_is_not_copied_to_elsewhere():
+    with pytest.raises(
+        ScanError, match=r"inside the folder of the scan, got one called '\.\./\.\./mine\.png'"
+    ):
+        Picture("../../mine.png", bytes, 4, 4)
+    assert Picture("left/0001.png", bytes, 4, 4).name == "left/0001.png"

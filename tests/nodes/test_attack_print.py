@@ -12,6 +12,7 @@ from advnerf_core.attack.printing.record import load_record
 from advnerf_core.fields.voxel_grid import face_corners_in_object
 from advnerf_core.geometry import Pinhole
 from nodes.cli import main as cli
+from nodes.experiment.node.printed import stem_of
 from tests.support.faces import face_attack
 
 
@@ -137,3 +138,15 @@ def test_nor_that_of_another_chart(monkeypatch, tmp_path, capsys):
     assert [file.name for file in tmp_path.glob("*.pdf")] == []
     assert (tmp_path / "chart.print.json").read_text() == before
     assert chart("-o", tmp_path / "chart.pdf", "--dpi", 60) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "stem"),
+    [
+        ("run.v1.attack.safetensors", "run.v1"),
+        ("run.v2.attack.safetensors", "run.v2"),
+        ("a.b.safetensors", "a.b"),
+    ],
+)
+def test_files_that_are_made_of_an_attack_have_its_whole_name(tmp_path, name, stem):
+    assert stem_of(tmp_path / name) == stem

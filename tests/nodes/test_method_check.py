@@ -46,6 +46,7 @@ def test_the_command_says_what_it_executes_and_takes_options(tmp_path: Path) -> 
     [
         ("budget", "< settings.evaluations", "<= settings.evaluations", "expected 6 evaluations, as Method.evaluations says, got 7"),
         ("budget", "return state.result()", "raise KeyError('x')", "raised KeyError: 'x'"),
+        ("budget", "return state.result()", "state.result()", "expected search to return a SearchResult, got NoneType"),
         ("result", "return state.result()", "r = state.result(); return type(r)(r.theta, r.history[0], r.history)", "expected the best evaluation"),
         ("seeds", ".manual_seed(run.seed)", ".manual_seed(0)", "expected other textures from seed 4"),
         ("seeds", ", generator=torch.Generator().manual_seed(run.seed)", "", "the same bytes from the same seed"),

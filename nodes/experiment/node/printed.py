@@ -21,6 +21,11 @@ def in_one_line(attack: AttackFile) -> str:
     return f"attack {attack.attack_id}, {attack.method}, predicted total CTE {total}, {clean}"
 
 
+def stem_of(file: Path) -> str:
+    """Name of an attack file without its ending: files that are made of it are called by it."""
+    return file.name.removesuffix(".safetensors").removesuffix(".attack") or file.stem
+
+
 def export_attack(attack: AttackFile, folder: Path, stem: str) -> list[Path]:
     """Write the texture of an attack's face as ``<stem>.texture.png``, and its meshes as ``<stem>.<number>_<name>.glb``."""
     from advnerf_core.data.image_files import write_image

@@ -8,8 +8,9 @@ from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
+from advnerf_core.files import is_plain_name
 from advnerf_core.geometry import Array, make_transform, rotation_x, rotation_y, rotation_z
 from advnerf_core.strict import Angle, StrictModel
 from hardware.worlds.paths import ReferencePath
@@ -28,6 +29,14 @@ from nodes.experiment.plan.object_kinds import (
 )
 from nodes.lab.located import NamedFile
 
+
+def _plain(name: str) -> str:
+    if not is_plain_name(name):
+        raise ValueError("expected a name without slashes, as files are called by it")
+    return name
+
+
+ObjectName = Annotated[str, AfterValidator(_plain)]
 Interval = tuple[float, float]
 FLAT = (PANEL, CUBE)
 _PLACE = {"name", "kind", "x_m", "y_m", "z_m", "yaw_rad", "scale"}
@@ -127,7 +136,7 @@ class PlacedObject(StrictModel):
         levels: Number of summed grids, coarse to fine, that give the colours of an object file; 0: one value per voxel.
     """
 
-    name: str = Field(min_length=1)
+    name: ObjectName
     kind: ObjectKind
     x_m: float
     y_m: float
@@ -237,7 +246,7 @@ class RuledObject(StrictModel):
         stands: The rule.
     """
 
-    name: str = Field(min_length=1)
+    name: ObjectName
     kind: ObjectKind
     z_m: float = 0.0
     scale: float = Field(default=1.0, gt=0.0, le=10.0)

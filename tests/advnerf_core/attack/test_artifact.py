@@ -176,3 +176,15 @@ def test_texture_is_the_squashed_grid_interpolated_at_cell_centres():
 def test_loading_needs_no_torch():
     code = "import sys, advnerf_core.attack.artifact, advnerf_core.attack.projection; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("name", ["x/../../../escaped", "..", "", "a\\b", "a\0"])
+def test_an_object_whose_name_would_lead_elsewhere_is_refused(name):
+    """Files are called by it, and an attack file may be a stranger's."""
+    with pytest.raises(AttackFileError, match="expected a name of an object without slashes"):
+        AttackedObject(name, np.ones((4, 3), np.float32), np.eye(4), 1.0, "")
+
+
+def test_a_mesh_that_is_no_glb_is_refused():
+    with pytest.raises(AttackFileError, match="expected the mesh of ball to be a GLB file"):
+        AttackedObject("ball", np.ones((4, 3), np.float32), np.eye(4), 1.0, "", b"#!/bin/sh")
