@@ -18,6 +18,7 @@ from nodes.runtime.errors import MessageError
 # Of a message that begins with a header, four bytes precede the stamp: the encapsulation of CDR, or the sequence number of ROS 1.
 _STAMP = struct.Struct("<iI"), struct.Struct(">iI")
 _STAMP_AT, _NS_PER_MS = 4, 1e6
+_Times = tuple[int, int, int, int]  # stamp, publish and log time, and number of a message
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,8 @@ class Delays:
         publish_worst_ms: Longest such delay.
         receive_ms: Median from publication to reception by the recorder.
         receive_worst_ms: Longest delay from publication to reception.
-        backwards: Number of messages whose stamp is older than the previous message's.
+        backwards: Number of messages whose stamp is older than the previous message's, or that were published before it: the clock of their
+            sender, or the recorder's, was set back.
         future: Number of messages with a capture time after their reception, which means a wrong clock.
     """
 
@@ -44,23 +46,27 @@ class Delays:
 def read_delays(bag: Path) -> dict[str, Delays]:
     """Read the delays of every topic with messages, by name. The whole bag is read."""
     stored = {name: topic for name, topic in recorded_topics(bag).items() if _begins_with_stamp(topic)}
-    rows: dict[str, list[tuple[int, int, int]]] = {}
+    rows: dict[str, list[_Times]] = {}
     for message in read_messages(bag, as_recorded=True):
         recorded = stored.get(message.topic)
         stamp_ns = 0 if recorded is None else _stamp_ns(message.cdr, recorded.serialization)
-        rows.setdefault(message.topic, []).append((stamp_ns, message.publish_ns, message.log_ns))
+        rows.setdefault(message.topic, []).append(
+            (stamp_ns, message.publish_ns, message.log_ns, message.sequence)
+        )
     published = has_publish_times(bag)
     return {topic: _delays(found, published) for topic, found in rows.items()}
 
 
-def _delays(times_ns: list[tuple[int, int, int]], published: bool) -> Delays:
-    """Compute delays from stamp, publish and log time of each message [ns]. Integers, because a damaged bag may have any value."""
+def _delays(times_ns: list[_Times], published: bool) -> Delays:
+    """Compute delays from stamp, publish and log time [ns] and number of each message. Integers, because a damaged bag may have any value."""
     stamped = [row for row in times_ns if row[0] > 0]
     return Delays(
-        *_median_and_worst([publish - stamp for stamp, publish, _ in stamped]),
-        *_median_and_worst([log - publish for _, publish, log in times_ns if published]),
-        sum(after[0] < before[0] for before, after in pairwise(stamped)) if stamped else None,
-        sum(stamp > log for stamp, _, log in stamped) if stamped else None,
+        *_median_and_worst([publish - stamp for stamp, publish, *_ in stamped]),
+        *_median_and_worst([log - publish for _, publish, log, _ in times_ns if published]),
+        sum(after[0] < before[0] or after[3] < before[3] for before, after in pairwise(stamped))
+        if stamped
+        else None,
+        sum(stamp > log for stamp, _, log, _ in stamped) if stamped else None,
     )
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from nodes.bags.reader import message_spans, read_messages
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import BagError
 
 # A running stack sends statuses every second. No recording is silent for an hour.
 LONGEST_SILENCE_S = 3600.0
@@ -56,6 +57,20 @@ def read_gaps(bag: Path) -> tuple[TimeGap, ...]:
             return find_gaps([message.log_ns for message in read_messages(bag, as_recorded=True)])
         end_ns = last_ns if end_ns is None else max(end_ns, last_ns)
     return ()
+
+
+def require_order(bag: Path, topic: str) -> None:
+    """Refuse a topic whose messages lie in another order than they were published in: the recorder's clock was set back while it ran.
+
+    Raises:
+        BagError: Their numbers go back more often than a publisher that was restarted once explains.
+    """
+    numbers = [message.sequence for message in read_messages(bag, [topic], as_recorded=True)]
+    if (back := sum(after < before for before, after in pairwise(numbers))) > 1:
+        raise BagError(
+            f"expected the messages of {topic} in {bag} in the order of their publication, got {back} that go back: the recorder's clock was set back "
+            "while it ran, so that two stretches of time are mixed; record the drive again"
+        )
 
 
 def skipped_gaps(bag: Path) -> tuple[TimeGap, ...]:

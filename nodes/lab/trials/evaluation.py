@@ -15,6 +15,7 @@ from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import yaw_of
 from nodes.bags.decoded import read_decoded
 from nodes.bags.reader import read_info, read_messages
+from nodes.bags.time_gaps import require_order
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
 from nodes.runtime.pictures import rgb_image
@@ -74,7 +75,12 @@ class Timing:
 
 
 def trajectory(bag: Path, start_real_ns: int, horizon: Horizon) -> Array:
-    """Read the states ``[K, 3]`` of the rear axle at the control ticks from motion capture. Tick 0 is at ``start_real_ns``."""
+    """Read the states ``[K, 3]`` of the rear axle at the control ticks from motion capture. Tick 0 is at ``start_real_ns``.
+
+    Raises:
+        BagError: There are no poses, or a recorder whose clock was set back has mixed them.
+    """
+    require_order(bag, "/vicon/car")
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     for message in read_decoded(bag, "/vicon/car"):

@@ -2,15 +2,18 @@ from pathlib import Path
 
 import pytest
 
+from advnerf_core.driving.metrics import Horizon
 from nodes.bags.play import Playhead
 from nodes.bags.reader import read_attachments, read_messages
+from nodes.bags.stamps import read_delays
 from nodes.bags.time_gaps import LONGEST_SILENCE_S, TimeGap, find_gaps, read_gaps, silence_s
 from nodes.bags.writer import BagWriter
+from nodes.lab.trials.evaluation import trajectory
 from nodes.player import PlayerConfig, PlayerNode
 from nodes.replaying.nodes import Choice
 from nodes.replaying.replay import Replay
 from nodes.runtime.clock import ManualClock
-from nodes.runtime.errors import NodeFinished
+from nodes.runtime.errors import BagError, NodeFinished
 from tests.support.commands import advnerf
 
 NS = 1_000_000_000
@@ -120,3 +123,16 @@ def test_info_names_the_gap(tmp_path, monkeypatch, capsys):
     shown = capsys.readouterr().out
     assert "log time jumps by 57 years after message 5" in shown
     assert "132 messages in 1." in shown
+
+
+def test_a_recorder_whose_clock_was_set_back_is_told_as_its_messages_are_mixed(tmp_path):
+    """As a time server does: what was driven before and after lies in the same half second of the bag."""
+    there = [message for message in read_messages(CORNER) if message.topic == "/vicon/car"]
+    middle = there[len(there) // 2].log_ns
+    bag = shifted(tmp_path / "bag", lambda number, log_ns: log_ns - NS // 2 * (log_ns > middle))
+    with pytest.raises(
+        BagError, match=r"of /vicon/car in .* in the order of their publication, got \d+ that go back"
+    ):
+        trajectory(bag, middle, Horizon(3, 0.1))
+    assert read_delays(CORNER)["/vicon/car"].backwards == 0
+    assert read_delays(bag)["/vicon/car"].backwards > 1
