@@ -14,9 +14,10 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
-from nodes.linking.keys import KeyFolder
+from nodes.linking.keys import KeyFolder, require_address, require_name
 from nodes.linking.link import Inbound, Link, LinkConfig, Offset
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import SecurityError
 from nodes.runtime.messages import header, type_hash_prefix, types
 from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
@@ -59,6 +60,14 @@ class GatewayConfig(StrictModel):
     def _one_end(self) -> GatewayConfig:
         if (self.listen is None) == (self.connect is None):
             raise ValueError("expected either listen or connect; give exactly one of them")
+        try:
+            require_address(self.listen or self.connect or "")
+            for name in (self.key, self.peer_key):
+                require_name(name)
+        except SecurityError as error:
+            raise ValueError(str(error)) from None
+        if self.watch_port == self.drive_port:
+            raise ValueError(f"expected two ports, got watch_port and drive_port {self.watch_port}")
         for name in (*self.exports, *self.imports):
             topic_row(name)
         if both := set(self.exports) & set(self.imports):

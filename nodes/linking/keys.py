@@ -25,6 +25,9 @@ WATCH, DRIVE = "watch", "drive"
 RIGHTS = (WATCH, DRIVE)
 _MAKE_KEYS = "Create keys with advnerf car keys new, allow the other host with advnerf car keys allow, and set keys to the folder"
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
+_LABEL = re.compile(
+    r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
+)  # of a name of a computer (RFC 1123; many have _)
 _KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 
 
@@ -164,9 +167,28 @@ class KeyFolder:
         return rows
 
     def _file(self, folder: str, name: str, suffix: str = ".pub") -> Path:
-        if not _NAME.fullmatch(name):
-            raise SecurityError(f"expected a name of at most 32 letters a-z, digits, - and _, got {name!r}")
+        require_name(name)
         return self.path / folder / f"{name}{suffix}"
+
+
+def require_name(name: str) -> None:
+    """Raise `SecurityError` for a name that no key has."""
+    if not _NAME.fullmatch(name):
+        raise SecurityError(f"expected a name of at most 32 letters a-z, digits, - and _, got {name!r}")
+
+
+def require_address(text: str) -> None:
+    """Raise for what is neither an IP address nor a name of a computer.
+
+    Raises:
+        SecurityError: It is neither, such as ``192.168.1.300``.
+    """
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        labels = text.split(".")
+        if not all(map(_LABEL.fullmatch, labels)) or labels[-1].isdecimal():
+            raise SecurityError(f"expected an IP address, or the name of a computer, got {text!r}") from None
 
 
 def is_loopback(address: str) -> bool:

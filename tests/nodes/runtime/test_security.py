@@ -184,6 +184,28 @@ def test_an_address_for_all_without_keys_is_refused(tmp_path):
         GatewayConfig(listen="127.0.0.1", exports=("/arm",), imports=("/arm",))
 
 
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (
+            {"listen": "192.168.1.300"},
+            "expected an IP address, or the name of a computer, got '192.168.1.300'",
+        ),
+        ({"connect": "nonsense host"}, "expected an IP address"),
+        (
+            {"connect": "robot.local", "watch_port": 5571},
+            "expected two ports, got watch_port and drive_port 5571",
+        ),
+        ({"connect": "robot.local", "key": "Laptop Ü"}, "expected a name of at most 32 letters a-z"),
+    ],
+)
+def test_addresses_ports_and_names_that_cannot_be_are_told_at_once(given, told):
+    with pytest.raises(ValueError, match=told):
+        GatewayConfig(**given)
+    assert GatewayConfig(connect="fe80::1%eth0").connect == "fe80::1%eth0"
+    assert GatewayConfig(connect="my_car-2.lab").connect == "my_car-2.lab"
+
+
 def test_messages_cross_with_their_count_stamp_and_publisher_and_clocks_are_compared(lab):
     robot, workstation = lab.robot(), lab.workstation()
     got = lab.run(60.0, lambda got: len(drives(got)) > 3, hello(workstation))
