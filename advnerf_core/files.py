@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
-import re
-import threading
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib import import_module
+from io import BufferedRandom
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,28 +17,40 @@ from advnerf_core.places import PlaceError, require_utf8
 
 PART = ".part"
 """End of the name of an output while it is written."""
-_PART_OF_A_THREAD = re.compile(r"(\.\d+)?\.part$")
 
 
 def write_atomically(path: Path, data: str | bytes, *, synced: bool = True) -> None:
-    """Write a whole file or nothing: under a temporary name first, then renamed over ``path``. Of several that write it at once the last counts.
+    """Write a whole file or nothing: under a temporary name first, then renamed over ``path``. Several that write it at once wait for each other.
 
     Args:
         synced: Whether to wait for the disk. A file that is not waited for may be lost in a power cut.
     """
     require_utf8(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.name}.{threading.get_native_id()}{PART}")
-    try:
-        with temporary.open("wb") as stream:
+    temporary = path.with_name(path.name + PART)
+    with _locked(temporary) as stream:
+        try:
+            stream.truncate()  # what a killed writer has left
             stream.write(data.encode() if isinstance(data, str) else data)
+            stream.flush()
             if synced:
-                stream.flush()
                 os.fsync(stream.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+def _locked(temporary: Path) -> BufferedRandom:
+    """A temporary file, open, that no other writer has; one that was renamed while it was waited for is another file."""
+    while True:
+        stream = os.fdopen(os.open(temporary, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
+        with suppress(OSError):  # of a file system without locks
+            fcntl.flock(stream, fcntl.LOCK_EX)
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(stream.fileno()), os.stat(temporary)):
+                return stream
+        stream.close()
 
 
 def refuse_overwriting(inputs: Iterable[Path | None], outputs: Iterable[Path]) -> None:
@@ -80,7 +93,7 @@ def write_json(path: Path, data: Any) -> None:
 def not_writable(path: str | os.PathLike[str], error: OSError) -> str:
     """Text of an error about an output that cannot be made."""
     why = error.strerror or str(error)
-    return f"expected a folder that can be written to, got {_PART_OF_A_THREAD.sub('', os.fsdecode(path))} ({why}); give another with -o or --folder"
+    return f"expected a folder that can be written to, got {os.fsdecode(path).removesuffix(PART)} ({why}); give another with -o or --folder"
 
 
 def sha256_of(file: Path) -> str:

@@ -139,19 +139,27 @@ class CameraCalibration(Intrinsics):
             raise ValueError(
                 f"expected a camera at most {_FURTHEST_CAMERA_M:g} m from the rear axle; is it in cm or mm?"
             )
-        require_rigid(rows)
-        # The camera's z axis looks into the picture, its y axis down (OpenCV); the car's x axis points ahead, its z axis up.
-        if rows[0][2] < _LEAST_AHEAD or rows[2][1] > -_LEAST_AHEAD:
-            raise ValueError(
-                "expected a camera that looks ahead, upright, with OpenCV's axes (x right, y down, z forward): column 3 of the rotation near "
-                f"1 0 0 and column 2 near 0 0 -1; got {rows[0][2]:.2f} {rows[1][2]:.2f} {rows[2][2]:.2f} and {rows[0][1]:.2f} {rows[1][1]:.2f} {rows[2][1]:.2f}"
-            )
-        return rows
+        return require_rigid(rows)
 
     @property
     def mount(self) -> Array:
-        """``T_car_from_camera`` as an array ``[4, 4]``."""
-        return np.array(self.T_car_from_camera)
+        """``T_car_from_camera`` as an array ``[4, 4]``.
+
+        Raises:
+            CalibrationError: The camera does not look ahead, upright, as one that nobody measured, or one with other axes.
+        """
+        rows = self.T_car_from_camera
+        # The camera's z axis looks into the picture, its y axis down (OpenCV); the car's x axis points ahead, its z axis up.
+        if rows[0][2] < _LEAST_AHEAD or rows[2][1] > -_LEAST_AHEAD:
+            raise CalibrationError(
+                "T_car_from_camera: expected a camera that looks ahead, upright, with OpenCV's axes (x right, y down, z forward): column 3 of the "
+                f"rotation near 1 0 0 and column 2 near 0 0 -1; got {_column(rows, 2)} and {_column(rows, 1)}"
+            )
+        return np.array(rows)
+
+
+def _column(rows: tuple[Row4, ...], number: int) -> str:
+    return " ".join(f"{row[number]:.2f}" for row in rows[:3])
 
 
 class GainsSection(StrictModel):

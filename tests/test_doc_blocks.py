@@ -13,9 +13,9 @@ import pytest
 
 from advnerf_core.display import DisplayModel
 from advnerf_core.report.audit_result import write_audit
-from calibration.by_construction import LAB_DATE, METHOD
+from calibration.by_construction import LAB_DATE
 from calibration.display_colour import DisplayCalibration
-from calibration.schema import save_calibration
+from calibration.schema import BY_CONSTRUCTION, save_calibration
 from tests.support.audits import audit_result
 from tests.support.stage_versions import measured
 
@@ -60,7 +60,7 @@ def home(tmp_path_factory):
     shutil.copytree(ROOT / "calibration" / "twin", folder / "calibration" / "my_car")
     curves = np.tile(np.linspace(0.0, 1.0, 17) ** 2.2, (3, 1))
     display = DisplayModel(curves, np.eye(3), np.full(3, 0.02), response=2.2, falloff=1.0)
-    measured_display = DisplayCalibration(date=LAB_DATE, method=METHOD, model=display.to_dict())
+    measured_display = DisplayCalibration(date=LAB_DATE, method=BY_CONSTRUCTION, model=display.to_dict())
     save_calibration(measured_display, folder / "calibration" / "my_car" / "display.yaml")
     shutil.copytree(run / "capture" / "photos", folder / "my_scene")
     write_audit(folder / "my_audit" / "audit.json", audit_result())

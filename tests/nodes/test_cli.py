@@ -370,7 +370,6 @@ def read_only(path):
         (lambda path: write_atomically(path, "text"), "/proc/nothing"),
         (read_only, "/mnt/a"),
         (lambda path: read_only(f"{path}.part"), "/mnt/a"),
-        (lambda path: read_only(f"{path}.4711.part"), "/mnt/a"),
     ],
 )
 def test_an_output_that_cannot_be_made_is_told_with_its_option(make, path):

@@ -36,7 +36,10 @@ def calibrations(plan: Plan) -> list[CheckResult]:
     rows, good = [], []
     for file, kind in dict.fromkeys(_calibration_files(plan)):
         try:
-            good.append((file, load_calibration(kind, file)))
+            found = load_calibration(kind, file)
+            if isinstance(found, CameraCalibration):
+                _ = found.mount  # an error says that it does not look ahead
+            good.append((file, found))
         except (AdvnerfError, OSError, ValueError) as error:
             rows += report("calibration", FAILURE, str(error), _CURE)
     if good:

@@ -154,7 +154,7 @@ def test_a_folder_that_cannot_lie_in_a_checkout_has_no_rows_to_check(place, caps
     ("change", "says"),
     [
         (lambda segments: segments[:-1], "expected a closed path to end at its start"),
-        (lambda segments: len(segments), "expected a path as"),
+        (lambda segments: len(segments), "expected a path "),
     ],
 )
 def test_a_registered_path_that_is_none_is_said_and_ends_nothing(copied, change, says):
