@@ -6,6 +6,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterable
 from contextlib import suppress
 from importlib import import_module
@@ -83,6 +84,11 @@ def refuse_overwriting(inputs: Iterable[Path | None], outputs: Iterable[Path]) -
 def is_plain_name(name: str) -> bool:
     """Whether a name is that of a file alone, on any system, so that a stranger's file cannot have others written elsewhere."""
     return name not in ("", ".", "..") and not any(each in name for each in "/\\\0")
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Key that sorts names by the numbers in them: ``9.jpg`` before ``10.jpg``."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def write_json(path: Path, data: Any) -> None:

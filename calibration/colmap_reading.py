@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.image_files import natural_order
 from advnerf_core.data.lens import Lens, straightening
+from advnerf_core.files import natural_order
 from advnerf_core.geometry import Array, Pinhole, require_camera
 from calibration.colmap_files import check_binary_files, model_folders
 from calibration.colmap_lens import lens_of, pinhole_of

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import struct
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -105,11 +104,6 @@ def size_of(data: bytes, source: str) -> tuple[int, int]:
         return int(width), int(height)
     rgb = decode_stored(data, source)
     return rgb.shape[1], rgb.shape[0]
-
-
-def natural_order(name: str) -> list[tuple[int, str]]:
-    """Key that sorts names by the numbers in them: ``9.jpg`` before ``10.jpg``."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def read_bytes(path: Path) -> bytes:

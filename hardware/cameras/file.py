@@ -7,7 +7,7 @@ from typing import Any
 
 import cv2
 
-from advnerf_core.data.image_files import natural_order
+from advnerf_core.files import natural_order
 from hardware.cameras.played import PlayedCamera
 from hardware.errors import DeviceNotFound, LinkLost
 

@@ -14,7 +14,7 @@ from advnerf_core.data import image_bytes, image_files, video
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.keyframes import MOVEMENT
 from advnerf_core.data.scan_folder import from_scan_advice
-from advnerf_core.files import write_atomically
+from advnerf_core.files import natural_order, write_atomically
 from calibration.photo_model import PhotoSource
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.runtime.progress import Report
@@ -97,7 +97,7 @@ def photographs_in(folder: Path) -> list[Path]:
     if others:
         kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
         print(f"{folder}: {len(files)} photographs; left out, as they are of other kinds: {kinds}")
-    return sorted(files, key=lambda path: image_files.natural_order(path.name))
+    return sorted(files, key=lambda path: natural_order(path.name))
 
 
 def _is_photograph(path: Path) -> bool:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from advnerf_core.csv_rows import read_csv
 from advnerf_core.data.errors import DatasetError
-from advnerf_core.data.image_files import natural_order, read_stored
+from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.errors import ConfigError, MissingFileError
+from advnerf_core.files import natural_order
 from advnerf_core.geometry import Array
 from calibration.camera_to_car import MountView
 from calibration.charuco import BoardDetector, Detection

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.csv_rows import read_csv
-from advnerf_core.data.image_files import natural_order
+from advnerf_core.files import natural_order
 from advnerf_core.geometry import Array
 from hardware.worlds.fitting import path_through
 from hardware.worlds.paths import ReferencePath
