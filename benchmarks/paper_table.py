@@ -23,6 +23,7 @@ PUBLISHED = REPOSITORY / "docs" / "results"
 _CARS = {
     "paper_car": "",
     "paper_car_sides": ", one side of the path maximised",
+    "paper_car_long": ", one side of the path maximised, searched longer",
     "paper_monitor": ", behind the way of a car that leaves the track",
 }
 _JUNCTIONS = {"paper_junction": "", "paper_junction_sides": ", one side of the path maximised"}
