@@ -14,7 +14,7 @@ from hardware.emulators.vesc_firmware import VescEmulatorConfig
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.bags.writer import BagWriter
-from nodes.linking.keys import DRIVE, WATCH, KeyFolder
+from nodes.linking.keys import DRIVE, KeyFolder
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import drive_message, pose_message
 from tests.support.harmful_recording import EVERY, recorded
@@ -177,7 +177,6 @@ def test_a_recording_of_a_hand_does_not_cross_to_another_host(car, tmp_path):
     keys["workstation"].add("robot", public["robot"])
     keys["robot"].add("workstation", public["workstation"])
     keys["robot"].allow("workstation", DRIVE)
-    keys["robot"].allow("workstation", WATCH)
     ports = (f"watch_port={PORTS[0]}", f"drive_port={PORTS[1]}")
     there = tmp_path / "workstation"
     there.mkdir()
