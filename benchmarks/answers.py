@@ -17,7 +17,6 @@ from advnerf_core.report.evidence.words import (
     NOT_DRIVEN,
     ends,
     excesses,
-    p_text,
     place_of,
     row_of,
     sample_of,
@@ -43,7 +42,6 @@ _COLUMNS = (
     "gradient minus random",
     "p",
     "gradient minus random in the learned scene",
-    "p there",
 )
 
 
@@ -128,7 +126,6 @@ def _line(found: Mapping[str, Any], test: Mapping[str, Any], about: Mapping[str,
         f"{test['difference_m']:+.3f} ({style_of(test['baseline']).title})",
         "not tested" if test["p_holm"] is None else f"{test['p_holm']:.4f}",
         f"{test['difference_surrogate_m']:+.3f}",
-        "not tested" if test["p_surrogate"] is None else p_text(test["p_surrogate"]),
     ]
 
 
