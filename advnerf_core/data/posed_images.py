@@ -47,11 +47,8 @@ def write_posed_images(
             write_image(folder / name, see(index))
             taken += 1
         if valid and (read := valid[index]) is not None:
-            masks[index] = f"masks/{index:05d}.png"
-            write_image(
-                folder / f"masks/{index:05d}.png",
-                np.dstack([np.where(read(), np.uint8(255), np.uint8(0))] * 3),
-            )
+            masks[index] = mask = f"masks/{index:05d}.png"
+            write_image(folder / mask, np.dstack([np.where(read(), np.uint8(255), np.uint8(0))] * 3))
         told(index + 1)
     if names:
         write_transforms(folder / "transforms.json", names, np.stack(poses), pinhole, masks=masks)

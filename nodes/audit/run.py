@@ -128,7 +128,9 @@ class Audit:
     def _run(self, known: Known) -> None:
         plan = AuditPlan.of(self.folder, self.question)
         self.minutes, self.evaluations = plan.agreed(self.minutes, self.evaluations)
-        known.minutes = self.minutes if self.evaluations is not None else self.minutes or USUAL_MIN
+        if self.evaluations is None:
+            self.minutes = self.minutes or USUAL_MIN
+        known.minutes = self.minutes
         copies = Copies.of(plan.save(), self.question)
         experiments = copies.learn(self.console)
         experiment = experiments[0]
@@ -214,10 +216,9 @@ class Audit:
             self.cluster,
         )
         if plan.decided.evaluations is None:
-            minutes = None if self.evaluations is not None else self.minutes or USUAL_MIN
-            if minutes is not None:
-                searches.evaluations = self._bought(copies.ready(_FIRST), searches, minutes)
-            plan.decide(evaluations=searches.evaluations, minutes=minutes)
+            if self.minutes is not None:
+                searches.evaluations = self._bought(copies.ready(_FIRST), searches, self.minutes)
+            plan.decide(evaluations=searches.evaluations, minutes=self.minutes)
         self.say(f"searching {searches.cost} evaluations")
         return searches
 

@@ -59,13 +59,15 @@ def read_gaps(bag: Path) -> tuple[TimeGap, ...]:
     return ()
 
 
-def require_order(bag: Path, topic: str) -> None:
+def require_order(bag: Path, topic: str, numbers: Sequence[int]) -> None:
     """Refuse a topic whose messages lie in another order than they were published in: the recorder's clock was set back while it ran.
+
+    Args:
+        numbers: The messages' numbers from their publisher, in the order of the bag.
 
     Raises:
         BagError: Their numbers go back more often than a publisher that was restarted once explains.
     """
-    numbers = [message.sequence for message in read_messages(bag, [topic], as_recorded=True)]
     if (back := sum(after < before for before, after in pairwise(numbers))) > 1:
         raise BagError(
             f"expected the messages of {topic} in {bag} in the order of their publication, got {back} that go back: the recorder's clock was set back "

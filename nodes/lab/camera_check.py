@@ -15,7 +15,7 @@ import numpy as np
 from hardware.cameras.interface import Camera, Frame
 from hardware.cameras.steady import SteadyCamera
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost
-from nodes.runtime.findings import CheckFinding, NotMet, look
+from nodes.runtime.findings import CheckFinding, NotMet, form_of, look
 from nodes.runtime.inbox import Inbox, ReaderThread
 
 _FRAMES = 4
@@ -113,8 +113,7 @@ def frames_have_their_form(bench: CameraBench) -> str:
     for frame in frames:
         rgb = frame.rgb
         if not isinstance(rgb, np.ndarray) or rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-            got = f"{rgb.dtype} {list(rgb.shape)}" if isinstance(rgb, np.ndarray) else type(rgb).__name__
-            raise NotMet(f"expected rgb [H, W, 3] uint8, got {got}; convert the image")
+            raise NotMet(f"expected rgb [H, W, 3] uint8, got {form_of(rgb)}; convert the image")
         if not rgb.flags.c_contiguous:
             raise NotMet("expected contiguous pixels, got a view; use numpy.ascontiguousarray")
         if rgb.flags.writeable:

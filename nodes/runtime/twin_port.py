@@ -18,7 +18,7 @@ from nodes.runtime.paths import bus_folder
 
 TWIN_NAME = "TWIN"
 _PEER = re.compile(rf"{TWIN_NAME} firmware \d+\.\d+")
-_PORT, _LOCK = "vesc", "vesc.lock"
+PORT, _LOCK = "vesc", "vesc.lock"
 # Major device numbers of Unix 98 pseudo-terminals (Linux, Documentation/admin-guide/devices.txt).
 _FIRST_PTS, _LAST_PTS = 136, 143
 _CLAIM_TRIES, _CLAIM_WAIT_S = 50, 0.02
@@ -52,14 +52,14 @@ def claim_twins_port(run_dir: Path) -> TextIO:
             if not tries_left:
                 raise
             time.sleep(_CLAIM_WAIT_S)  # a motor node may be looking
-    (run_dir / _PORT).unlink(missing_ok=True)
+    (run_dir / PORT).unlink(missing_ok=True)
     return claim
 
 
 def is_twins_port(run_dir: Path, port: str) -> bool:
     """Whether a serial port is the pseudo-terminal that a living twin of this run has made."""
     try:
-        mine, twins = os.stat(port), os.stat(run_dir / _PORT)
+        mine, twins = os.stat(port), os.stat(run_dir / PORT)
     except OSError:
         return False
     if not (stat.S_ISCHR(mine.st_mode) and _FIRST_PTS <= os.major(mine.st_rdev) <= _LAST_PTS):

@@ -204,10 +204,15 @@ def require_searchable(experiment: Experiment, cells: Sequence[Cell]) -> None:
 def _require_objective(experiment: Experiment) -> None:
     objective = experiment.config.attack.objective  # a built-in one was checked when the file was read
     if objective not in OBJECTIVES and load_objective(objective).needs_solids and experiment.solids is None:
-        raise NoSuchCellError(
-            f"{experiment.file}: expected an objective that needs no solids, as the world {experiment.named_world.kind} does not say what its car can "
-            f"hit, got {objective}; choose another, or add solids to the world (docs/worlds.md)"
-        )
+        raise NoSuchCellError(f"{experiment.file}: {without_solids(experiment)}")
+
+
+def without_solids(experiment: Experiment) -> str:
+    """What is wrong with an objective that needs solids in a world without any."""
+    return (
+        f"attack.objective: expected an objective that needs no solids, as the world {experiment.named_world.kind} does not say what its car can "
+        f"hit, got {experiment.config.attack.objective}; choose cte, or add solids to the world (docs/worlds.md)"
+    )
 
 
 def _require_gradient(experiment: Experiment, cell: Cell) -> None:

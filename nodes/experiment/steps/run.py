@@ -24,6 +24,7 @@ from nodes.experiment.show.experiment_world import NotCapturedError
 from nodes.experiment.show.given import VictimUnknownError, given_in, victim_spec
 from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_worlds
 from nodes.experiment.show.victims import look_at_given
+from nodes.experiment.steps.keys import without_solids
 from nodes.experiment.steps.live import check_live
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.retrain import pays_from_m
@@ -93,12 +94,9 @@ def _check_ticks(experiment: Experiment, document: Document) -> None:
 
 
 def _check_objective(experiment: Experiment, document: Document) -> None:
-    """Check that the objective collision has a world with obstacles; users' objectives are checked when they are loaded."""
+    """Check that the objective collision has a world with obstacles; users' objectives are checked before any stage."""
     if experiment.config.attack.objective == "collision" and experiment.solids is None:
-        raise ConfigError(
-            f"{document.place(('attack', 'objective'))}: attack.objective: expected an objective that needs no solids, as the world "
-            f"{experiment.named_world.kind} does not say what its car can hit, got collision; choose cte, or add solids to the world (docs/worlds.md)"
-        )
+        raise ConfigError(f"{document.place(('attack', 'objective'))}: {without_solids(experiment)}")
 
 
 def _check_native(experiment: Experiment, document: Document) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -56,7 +55,7 @@ class MetricOptions:
             raise ImportRecordingError(
                 f"expected one source of the scale, got {' and '.join(given)}; give one of them"
             )
-        if self.length is not None and not 0.0 < self.length[2] < math.inf:
+        if self.length is not None and not self.length[2] > 0.0:
             raise ImportRecordingError(
                 f"expected --length A B METRES with a length above 0 m, got {self.length[2]:g}; correct it"
             )

@@ -31,7 +31,7 @@ HOPS = {
 SENT = "/motor/sent"
 # Topics on which nodes report that they show an attack, with its id.
 SHOWN_BY = ("/compositor/attack", "/monitor/attack")
-_SEEN = "/compositor/image"
+_CAR, _SEEN = "/vicon/car", "/compositor/image"
 COUNTERFACTUAL = "/policy/counterfactual"
 _NS_PER_MS = 1e6
 
@@ -80,18 +80,21 @@ def trajectory(bag: Path, start_real_ns: int, horizon: Horizon) -> Array:
     Raises:
         BagError: There are no poses, or a recorder whose clock was set back has mixed them.
     """
-    require_order(bag, "/vicon/car")
     stamps: list[int] = []
+    numbers: list[int] = []
     poses: list[tuple[float, float, float]] = []
-    for message in read_decoded(bag, "/vicon/car"):
+    for recorded in read_messages(bag, [_CAR]):
+        numbers.append(recorded.sequence)
+        message = decode(topic_row(_CAR).type, recorded.cdr)
         stamp_ns = ns_from_stamp(message.header.stamp)
         if stamps and stamp_ns <= stamps[-1]:
             continue
         T = pose_matrix(message)
         stamps.append(stamp_ns)
         poses.append((T[0, 3], T[1, 3], yaw_of(T)))
+    require_order(bag, _CAR, numbers)
     if len(stamps) < 2:
-        raise BagError(f"expected a stream of poses on /vicon/car in {bag}, got {len(stamps)}")
+        raise BagError(f"expected a stream of poses on {_CAR} in {bag}, got {len(stamps)}")
     return states_at_ticks(np.array(stamps), np.array(poses), start_real_ns, horizon)
 
 

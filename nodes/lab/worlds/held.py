@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import types
 from collections.abc import Callable
+from functools import lru_cache, wraps
 from typing import Any, cast
 
 import numpy as np
@@ -14,7 +14,7 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole, VehicleState
 from advnerf_core.plugins import PluginError, in_one_line
 from hardware.worlds.world import World, WorldClass, WorldDescription, members_of_a_world
-from nodes.runtime.findings import NotMet
+from nodes.runtime.findings import NotMet, form_of
 
 
 class OwnWorldError(NotMet, PluginError):
@@ -46,18 +46,17 @@ def require_depth_of(depth_m: Any, camera: Pinhole, name: str) -> None:
         )
 
 
-def form_of(array: Any) -> str:
-    """Type and shape of an array, or the type of anything else."""
-    return f"{array.dtype} {list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__
-
-
 def held_to_its_word(world_class: WorldClass, kind: str) -> WorldClass:
     """A world's class with the same behaviour, of which each member's error names the world, file and line, and each result is checked.
 
     Args:
         kind: The world's name, for messages.
     """
-    base = cast("type[Any]", world_class)
+    return cast("WorldClass", _made(cast("Any", world_class), kind))
+
+
+@lru_cache(maxsize=64)  # a world is made for each question about it
+def _made(base: type[Any], kind: str) -> type[Any]:
     members: dict[str, Any] = {}
     for name in ("__init__", *members_of_a_world()):
         member = inspect.getattr_static(base, name, None)
@@ -67,13 +66,13 @@ def held_to_its_word(world_class: WorldClass, kind: str) -> WorldClass:
             members[name] = _held(member, kind, name)
     made = types.new_class(base.__name__, (base,), exec_body=lambda body: body.update(members))
     made.__module__ = base.__module__
-    return cast("WorldClass", made)
+    return made
 
 
 def _held(member: Any, kind: str, name: str) -> Callable[..., Any]:
     require = _REQUIRED.get(name)
 
-    @functools.wraps(member)
+    @wraps(member)
     def call(world: Any, *args: Any, **named: Any) -> Any:
         try:
             given = member(world, *args, **named)
@@ -106,10 +105,9 @@ def _require_photograph(world: World, rgb: Any, name: str) -> None:
 
 def _require_poses(_world: World, poses: Any, name: str) -> None:
     wanted = f"expected a list of poses [4, 4] with finite numbers from {name}, one for each photograph"
-    if not isinstance(poses, list | tuple | np.ndarray) or len(poses) == 0:
-        raise NotMet(
-            f"{wanted}; got {form_of(poses)} with {len(poses) if hasattr(poses, '__len__') else 'no'} poses"
-        )
+    count = len(poses) if isinstance(poses, list | tuple | np.ndarray) else 0
+    if not count:
+        raise NotMet(f"{wanted}; got {form_of(poses)} with {count} poses")
     for index, pose in enumerate(poses):
         if np.shape(pose) != (4, 4) or not np.isfinite(np.asarray(pose, dtype=float)).all():
             raise NotMet(f"{wanted}; got {np.asarray(pose).tolist()!s:.120} at {index}")

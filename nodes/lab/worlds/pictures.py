@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from advnerf_core.geometry import Array, planar_pose
 from hardware.worlds.world import Rgb, require_depth, traits_of
 from nodes.lab.worlds.bench import WorldBench, pose_of
-from nodes.lab.worlds.held import form_of, require_depth_of, require_picture
-from nodes.runtime.findings import NotMet
+from nodes.lab.worlds.held import require_depth_of, require_picture
+from nodes.runtime.findings import NotMet, form_of
 
 # Below this spread a picture counts as one colour [grey levels].
 _LEAST_SPREAD = 1.0

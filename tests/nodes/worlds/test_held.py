@@ -128,8 +128,10 @@ def test_our_own_errors_pass_and_a_good_world_is_unchanged(tmp_path):
     with pytest.raises(NotOpenError) as error:
         closed.describe()
     assert str(error.value) == "open it"
-    with own(tmp_path, "    pass\n").make() as held, small().make() as plain:
+    named = own(tmp_path, "    pass\n")
+    with named.make() as held, small().make() as plain:
         assert type(held).__name__ == "Mine"
+        assert type(named.make()) is type(held)
         assert held.describe().to_dict() == plain.describe().to_dict()
         for one, other in zip(look(held), look(plain), strict=True):
             np.testing.assert_array_equal(one, other)
