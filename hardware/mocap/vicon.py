@@ -55,6 +55,13 @@ class SubjectPose:
     receive_mono_ns: int
 
 
+def free_udp_port() -> int:
+    """A UDP port that nobody uses, for a simulated Tracker of one's own: a lab or another run on this computer does not send to it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
 @dataclass(frozen=True)
 class ViconConfig:
     """Configuration of the receiver.

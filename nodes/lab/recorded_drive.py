@@ -27,6 +27,7 @@ from advnerf_core.files import write_atomically, write_json
 from advnerf_core.geometry import Array, invert_transform
 from advnerf_core.policies.load import load_driver
 from calibration.schema import CameraCalibration, RoomCalibration, TargetCalibration, load_calibration
+from hardware.mocap.vicon import free_udp_port
 from nodes.lab.recorded_victim import ABOUT, FILM, FOLDER, LABEL, NOW, RecordedVictim, find_recorded
 from nodes.lab.trials.evaluation import frames, score, trajectory
 from nodes.lab.trials.trial import TrialPlan
@@ -44,7 +45,6 @@ _NODES = ("twin", "camera", "vicon", "compositor", "policy", "safety", "motor")
 _HORIZON = Horizon(60)
 _SPEED_MPS = 0.8
 _READY_S = 30.0
-_VICON_PORT = 51177
 
 Rgb = NDArray[np.uint8]
 Show = Callable[[Rgb], None]
@@ -112,7 +112,7 @@ def _through_nodes(victim: RecordedVictim, folder: Path, show: Show) -> Driven:
         f"params.calibration={calibration}",
         f"params.policy={victim.policy}",
         f"params.attack={victim.attack}",
-        f"params.vicon_port={_VICON_PORT}",
+        f"params.vicon_port={free_udp_port()}",
     ]
     run_dir, drive_dir = folder / "nodes", folder / "drive"
     plan = TrialPlan(room.start_pose, _HORIZON.ticks * _HORIZON.dt_s + 0.2, _NODES)

@@ -24,10 +24,11 @@ from typing import Any
 import pytest
 
 from advnerf_core.geometry import planar_pose
+from hardware.mocap.vicon import free_udp_port
 from nodes.runtime.messages import encode, pose_message
 from tests.campaigns.campaign import Campaign
 from tests.support.live.operator import LiveOperator
-from tests.support.live.processes import REPOSITORY, free_udp_port
+from tests.support.live.processes import REPOSITORY
 from tests.support.live.ros2_strangers import (
     HONEST_SPEED_MPS,
     HONEST_STEERING_RAD,

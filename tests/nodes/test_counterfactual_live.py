@@ -13,6 +13,7 @@ from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import load_policy, save_policy
 from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration
+from hardware.mocap.vicon import free_udp_port
 from nodes.bags.reader import read_messages
 from nodes.lab.trials.evaluation import counterfactual
 from nodes.lab.trials.trial import TrialOutcome, TrialPlan
@@ -22,7 +23,6 @@ from nodes.runtime.messages import decode, ns_from_stamp
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 from tests.support.faces import red_attack
-from tests.support.live.processes import free_udp_port
 
 ROOT = Path(__file__).parents[2]
 TWIN = ROOT / "calibration" / "twin"

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hardware.mocap.vicon import free_udp_port
 from nodes.bags.reader import read_messages
 from nodes.lab.trials.evaluation import attack_ids
 from nodes.lab.trials.trial import TrialPlan
@@ -30,7 +31,7 @@ def test_the_lab_camera_sees_the_attack_while_armed_and_not_before(tmp_path):
         "policy.speed_mps=0.5",
         f"params.calibration={ROOT / 'calibration' / 'twin'}",
         f"params.attack={attack}",
-        "params.vicon_port=52801",
+        f"params.vicon_port={free_udp_port()}",
     ]
     start = (1.95, -0.5, 0.5 * np.pi)
     launch, plan = ROOT / "launch" / "monitor.launch.yaml", TrialPlan(start, 1.5, NODES)

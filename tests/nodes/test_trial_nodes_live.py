@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from hardware.mocap.vicon import free_udp_port
 from nodes.bags.reader import read_attachment, read_info
 from nodes.lab.trials.evaluation import attack_ids
 from nodes.lab.trials.trial import SpoiledError, TrialPlan
@@ -26,7 +27,7 @@ def test_nodes_are_started_once_for_drives_with_and_without_an_attack_and_again_
     shared = [
         "policy.module=tests.support.live.straight_policy",
         f"params.calibration={TWIN}",
-        "params.vicon_port=52807",
+        f"params.vicon_port={free_udp_port()}",
     ]
     seen = []
 
@@ -79,7 +80,7 @@ def test_a_graph_whose_drive_does_not_count_is_not_used_again(tmp_path, monkeypa
     shared = [
         "policy.module=tests.support.live.straight_policy",
         f"params.calibration={TWIN}",
-        "params.vicon_port=52809",
+        f"params.vicon_port={free_udp_port()}",
     ]
     with TrialNodes(ROOT / "launch" / "green_screen.launch.yaml", tmp_path / "nodes", 90.0) as nodes:
         with pytest.raises(SpoiledError, match="late"):

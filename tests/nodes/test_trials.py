@@ -12,6 +12,7 @@ from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import planar_pose
 from benchmarks.host_pair import exchange_keys
 from calibration.schema import CalibrationError
+from hardware.mocap.vicon import free_udp_port
 from nodes.bags.reader import read_messages
 from nodes.bags.writer import BagWriter
 from nodes.cli.main import app
@@ -23,7 +24,7 @@ from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import encode, header, pose_message, types
 from tests.support.faces import face_attack
-from tests.support.live.processes import free_ports, free_udp_port
+from tests.support.live.processes import free_ports
 from tests.support.messages import filled
 
 ROOT = Path(__file__).parents[2]
@@ -282,7 +283,10 @@ def test_bags_without_a_drive_say_what_they_lack(tmp_path):
 def test_a_series_on_the_twin_counts_what_its_bags_say_and_goes_on(tmp_path):
     from nodes.lab.trials.series import drive_series
 
-    calibration = [f"params.calibration={ROOT / 'calibration' / 'twin'}", "params.vicon_port=52871"]
+    calibration = [
+        f"params.calibration={ROOT / 'calibration' / 'twin'}",
+        f"params.vicon_port={free_udp_port()}",
+    ]
     stands_in = ["policy.module=tests.support.live.straight_policy", "policy.speed_mps=0.5"]
     made = prepare_series(
         ROOT / "launch" / "green_screen.launch.yaml",

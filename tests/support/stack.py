@@ -13,10 +13,11 @@ import yaml
 
 from advnerf_core.geometry import planar_pose
 from hardware.emulators.vesc_firmware import WireEvent
+from hardware.mocap.vicon import free_udp_port
 from nodes.runtime.messages import pose_message
 from nodes.runtime.paths import bus_folder
 from tests.support.live.operator import LiveOperator
-from tests.support.live.processes import REPOSITORY, free_udp_port
+from tests.support.live.processes import REPOSITORY
 from tests.support.spoiled import Spoiled, unspoiled
 
 CALIBRATION = REPOSITORY / "calibration" / "twin"

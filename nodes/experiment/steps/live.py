@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -15,6 +14,7 @@ import numpy as np
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.driving.metrics import DriveMetrics, Horizon, first_still_tick
+from hardware.mocap.vicon import free_udp_port
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.world import collided_with
 from nodes.control.stop_causes import is_stall
@@ -139,7 +139,7 @@ class LiveNodes:
         """Drive one run, into a folder for ``trial.json`` and the bag, with more overrides of the launch file; see `TrialNodes.drive`."""
         experiment = self._experiment
         if not self.graph.pids:
-            self._vicon_port = _free_udp_port()
+            self._vicon_port = free_udp_port()
         overrides = [f"params.vicon_port={self._vicon_port}", *live_overrides(experiment, live), *more]
         # Nothing is known of the memory of a user's policy but what it declares.
         again = _REMEMBERING if live.victim in given_in(experiment.config) else ()
@@ -263,13 +263,6 @@ def _horizon(experiment: Experiment, live: LiveRun) -> Horizon:
     """Control ticks over which a run is measured."""
     limits = experiment.limits
     return limits if live.ticks is None else Horizon(live.ticks, limits.dt_s, limits.off_track_m)
-
-
-def _free_udp_port() -> int:
-    """A port for this run's motion capture, so that a lab or another run on this host does not answer."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _check_drawn(live: LiveRun, drawn: list[str]) -> None:

@@ -17,14 +17,13 @@ from hardware.emulators.vesc_emulator import VescEmulator
 from hardware.emulators.vesc_firmware import VescEmulatorConfig
 from hardware.emulators.vicon_emulator import ViconEmulatorConfig
 from hardware.errors import LinkLost
-from hardware.mocap.vicon import ViconConfig
+from hardware.mocap.vicon import ViconConfig, free_udp_port
 from hardware.motor.vesc_settings import TimeoutSettings
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.lab.doctor import mocap, motor
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, DoctorCheck, examine
 from tests.support.faulty_devices import FaultyVescEmulator, FaultyViconEmulator
-from tests.support.live.processes import free_udp_port
 
 TWIN = Path(__file__).parents[3] / "calibration" / "twin"
 GOOD = {"timeout_ms": 250.0, "timeout_brake_current_a": 20.0}

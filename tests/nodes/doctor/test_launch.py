@@ -17,7 +17,7 @@ import yaml
 from hardware.emulators.vesc_emulator import VescEmulator
 from hardware.emulators.vesc_firmware import VescEmulatorConfig
 from hardware.emulators.vicon_emulator import ViconEmulator, ViconEmulatorConfig
-from hardware.mocap.vicon import ViconConfig
+from hardware.mocap.vicon import ViconConfig, free_udp_port
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.cli import main as cli
@@ -26,7 +26,7 @@ from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, examine
 from nodes.lab.doctor.launch import checks_of, pictures_of
 from nodes.launching.launch_file import load_launch
 from nodes.linking.keys import DRIVE, KeyFolder
-from tests.support.live.processes import free_ports, free_udp_port
+from tests.support.live.processes import free_ports
 
 ROOT = Path(__file__).parents[3]
 TWIN = ROOT / "calibration" / "twin"

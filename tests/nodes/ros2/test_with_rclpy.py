@@ -15,11 +15,11 @@ import pytest
 
 from advnerf_core.geometry import planar_pose
 from benchmarks.rclpy_peer import PEERS, ROOT, RclpyPeer, peers_have
+from hardware.mocap.vicon import free_udp_port
 from nodes.bags import read_info, read_messages
 from nodes.runtime.messages import decode, drive_message, image_message, pose_message, stamp_ns, types
 from nodes.runtime.messages import header as make_header
 from tests.support.live.operator import LiveOperator
-from tests.support.live.processes import free_udp_port
 from tests.support.live.ros2_bridge import VEHICLE, Bridge
 
 pytestmark = [pytest.mark.ros2, pytest.mark.live]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.geometry import planar_pose
+from hardware.mocap.vicon import free_udp_port
 from nodes.runtime.messages import pose_message
 from tests.support.live.operator import LiveOperator
 from tests.support.live.processes import REPOSITORY, end
@@ -23,8 +24,6 @@ VICTIMS = ("camera", "vicon", "compositor", "policy", "safety", "motor")
 NODES = ("twin", *VICTIMS)
 START = (-1.1, -2.0, 0.0)
 CONFIGURED = {"timeout_ms": 250.0, "timeout_brake_current_a": 20.0}
-# Not the default, so that it does not meet a lab that is running.
-_VICON_PORT = 51087
 _RULE = "{max_restarts: 1000, delay_s: 0.2, max_delay_s: 0.2}"
 _RESPAWNING = (
     "record=false",
@@ -55,9 +54,11 @@ class Graph:
     ) -> None:
         self.folder = folder
         self.settings = _RESPAWNING if settings is None else tuple(settings)
+        # Of its own, so that it does not meet a lab, or other tests, that run on this host.
+        self._vicon_port = free_udp_port()
         config = folder / "twin.yaml"
         config.write_text(
-            json.dumps({"vesc": dict(controller), "vicon": {"port": _VICON_PORT}}), encoding="utf-8"
+            json.dumps({"vesc": dict(controller), "vicon": {"port": self._vicon_port}}), encoding="utf-8"
         )
         self.log = (folder / "campaign.log").open("ab")
         arguments = ("--name", "twin", "--config", str(config), "--folder", str(folder))
@@ -69,7 +70,7 @@ class Graph:
 
     def launch(self) -> subprocess.Popen[bytes]:
         """Start the launch; its process."""
-        settings = ("twin.if=false", f"params.vicon_port={_VICON_PORT}", *self.settings)
+        settings = ("twin.if=false", f"params.vicon_port={self._vicon_port}", *self.settings)
         overrides = [part for setting in settings for part in ("--set", setting)]
         return self._start("nodes.cli", "launch", str(LAUNCH_FILE), "--folder", str(self.folder), *overrides)
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.documents import read_json
+from hardware.mocap.vicon import free_udp_port
 from tests.support.live.operator import LiveOperator
 from tests.support.live.processes import REPOSITORY, end
 
@@ -27,8 +28,6 @@ PHONE = {
     "has_touch": True,
 }
 LONG_MS = 60_000
-# Not the default, so that it does not meet a lab that is running.
-_VICON_PORT = 51088
 
 
 def available() -> bool:
@@ -63,7 +62,7 @@ def live_page(
     chosen = [
         f"params.page_host={host}",
         f"params.page_port={port}",
-        f"params.vicon_port={_VICON_PORT}",
+        f"params.vicon_port={free_udp_port()}",
         *(
             ("policy.module=tests.support.live.straight_policy", "params.counterfactual=false")
             if straight

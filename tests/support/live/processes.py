@@ -24,15 +24,12 @@ def end(process: subprocess.Popen[Any], patience_s: float = 20.0) -> None:
         process.wait()
 
 
-def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_STREAM) -> list[int]:
-    """Ports of this computer that nobody uses."""
+def free_ports(count: int) -> list[int]:
+    """TCP ports of this computer that nobody uses."""
     with contextlib.ExitStack() as stack:
-        probes = [stack.enter_context(socket.socket(socket.AF_INET, kind)) for _ in range(count)]
+        probes = [
+            stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) for _ in range(count)
+        ]
         for probe in probes:
             probe.bind(("127.0.0.1", 0))
         return [int(probe.getsockname()[1]) for probe in probes]
-
-
-def free_udp_port() -> int:
-    """A UDP port of this computer that nobody uses."""
-    return free_ports(1, socket.SOCK_DGRAM)[0]
