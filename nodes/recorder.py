@@ -12,7 +12,8 @@ from pydantic import Field
 
 from advnerf_core.strict import StrictModel
 from nodes.bags.writer import BagWriter, SplitLimits
-from nodes.runtime.errors import BagError
+from nodes.runtime.errors import BagError, NodeFinished
+from nodes.runtime.messages import decode
 from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.paths import RESOLVED_NAME
 from nodes.runtime.process import run_node_main
@@ -21,6 +22,7 @@ from nodes.runtime.topics import topic as topic_row
 
 # Period of finishing the current chunk. A power cut loses little more than this.
 _FLUSH_HZ = 1.0
+_PAGE_ACT, _PAGE_STOPS = "/operator/act", "record_stop"
 
 
 class RecorderConfig(StrictModel):
@@ -33,6 +35,7 @@ class RecorderConfig(StrictModel):
         attachments: Files to attach, such as calibration and attack files.
         queue: Messages per topic that may wait while the disk is busy.
         max_bag_duration_s: Time after which a new file starts [s]. The default keeps the index of a quiet recording small.
+        until_page_stops: End when the operator page says so, with all that it said before.
         max_bag_size_mb: Size at which a new file starts [MiB], after compression. The index of a file takes about 700 bytes of memory
             per image, or per 64 KiB of small messages.
     """
@@ -42,6 +45,7 @@ class RecorderConfig(StrictModel):
     statuses_of: list[str] = Field(default_factory=list)
     attachments: list[Path] = Field(default_factory=list)
     queue: int = Field(default=200, ge=1)
+    until_page_stops: bool = False
     max_bag_duration_s: float = Field(default=SplitLimits.duration_s, gt=0, allow_inf_nan=False)
     max_bag_size_mb: float = Field(default=SplitLimits.size_mib, gt=0, allow_inf_nan=False)
 
@@ -51,14 +55,17 @@ class RecorderNode(Node):
 
     Args:
         queue: Messages that may wait per topic.
+        until_page_stops: As in `RecorderConfig`.
     """
 
     opens = "a new bag"
     raw = True
     tick_rate_hz = _FLUSH_HZ
 
-    def __init__(self, writer: BagWriter, topics: list[str], queue: int) -> None:
-        self._writer = writer
+    def __init__(
+        self, writer: BagWriter, topics: list[str], queue: int, until_page_stops: bool = False
+    ) -> None:
+        self._writer, self._until_page_stops = writer, until_page_stops
         self._lost = dict.fromkeys(topics, 0)
         self.subscriptions = tuple(topics)
         self.queues = dict.fromkeys(topics, queue)
@@ -73,7 +80,7 @@ class RecorderNode(Node):
         limits = SplitLimits(config.max_bag_duration_s, config.max_bag_size_mb)
         folder = context.run_dir / config.output
         writer = BagWriter(folder, attachments, provenance(), limits=limits, compressed=True)
-        return cls(writer, topics, config.queue)
+        return cls(writer, topics, config.queue, config.until_page_stops)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Write one message."""
@@ -81,6 +88,10 @@ class RecorderNode(Node):
             topic, info.raw, info.receive_real_ns, info.publish_real_ns, info.sequence, info.lost
         )
         self._lost[topic] += info.lost
+        if self._until_page_stops and topic == _PAGE_ACT:
+            act = decode(topic_row(topic).type, info.raw)
+            if act.act == _PAGE_STOPS and act.granted:
+                raise NodeFinished(f"{act.operator or 'the page'} stopped the recording")
         return []
 
     def tick(self, now: Now) -> list[Out]:

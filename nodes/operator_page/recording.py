@@ -14,7 +14,7 @@ from nodes.launching.child import Child
 from nodes.launching.launch_schema import NodeEntry
 
 RECORDER, LAUNCH_RECORDER, TELEOP = "page_recorder", "recorder", "/teleop/state"
-_KILL_AFTER_S = 10.0
+_SIGNAL_AFTER_S, _KILL_AFTER_S = 2.0, 10.0
 
 
 class RecorderControl:
@@ -55,7 +55,7 @@ class RecorderControl:
         self._folder = f"bags/{time.strftime('%Y%m%d-%H%M%S')}"
         if (self._run_dir / self._folder).exists():
             return f"{self._folder} exists; try again in a second"
-        config = {"output": self._folder, "statuses_of": list(self._nodes)}
+        config = {"output": self._folder, "statuses_of": list(self._nodes), "until_page_stops": True}
         child = Child(RECORDER, NodeEntry(module="nodes.recorder"), self._run_dir)
         try:
             write_atomically(child.config, json.dumps(config))
@@ -66,11 +66,15 @@ class RecorderControl:
         return ""
 
     def stop(self) -> str:
-        """Ask the recorder to finish its bag. Returns why not; empty if it was asked."""
+        """Let the recorder finish its bag. Returns why not; empty if it will.
+
+        It ends with the act that this call belongs to, which reaches it after all labels; one that does not hear the page is sent a signal.
+        """
         if self._child is None or not self._child.running:
             return "not recording"
-        self._child.signal(signal.SIGINT)
         self._asked_s = time.monotonic()
+        if not self._connected:
+            self._child.signal(signal.SIGINT)
         return ""
 
     def check(self) -> None:
@@ -79,8 +83,9 @@ class RecorderControl:
         if child is None:
             return
         if child.running:
-            if self._asked_s is not None and time.monotonic() - self._asked_s > _KILL_AFTER_S:
-                child.signal(signal.SIGKILL)
+            waited_s = 0.0 if self._asked_s is None else time.monotonic() - self._asked_s
+            if waited_s > _SIGNAL_AFTER_S:
+                child.signal(signal.SIGINT if waited_s < _KILL_AFTER_S else signal.SIGKILL)
             return
         if self._asked_s is None or child.exit_code:
             self._trouble = f"the recorder {child.how_it_ended()}"
@@ -107,6 +112,5 @@ class RecorderControl:
         """Finish the bag, and wait for it."""
         if self._child is None or not self._child.running:
             return
-        if self._asked_s is None:
-            self.stop()
+        self._child.signal(signal.SIGINT)
         self._child.wait_or_kill(_KILL_AFTER_S)

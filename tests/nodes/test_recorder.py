@@ -16,9 +16,10 @@ from nodes.bags.repair_parts import repair_bag
 from nodes.recorder import RecorderConfig, RecorderNode, provenance
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import Now, SystemClock
-from nodes.runtime.errors import BagError
-from nodes.runtime.messages import encode, image_message, pose_message
+from nodes.runtime.errors import BagError, NodeFinished
+from nodes.runtime.messages import decode, encode, header, image_message, pose_message, types
 from nodes.runtime.node import MessageInfo, NodeContext
+from tests.support.messages import filled
 
 pytestmark = pytest.mark.live
 
@@ -45,6 +46,31 @@ def test_wire_bytes_and_all_times_go_into_the_bag_with_what_rides_along(tmp_path
     assert read_attachment(tmp_path / "bag", "launch.resolved.yaml") == b"name: x\n"
     assert read_info(tmp_path / "bag").topics[0].lost == 4
     assert read_info(tmp_path / "bag").metadata.keys() >= {"git", "version", "host", "python"}
+
+
+def test_the_page_ends_its_recorder_by_the_act_that_follows_its_labels(tmp_path):
+    """A signal would overtake them."""
+    node = RecorderNode.build(
+        RecorderConfig(topics=["/operator/act"], until_page_stops=True), context(tmp_path)
+    )
+
+    def hear(number, act, granted=True):
+        cdr = encode(
+            filled(types.OperatorAct, header=header(number), operator="Ann", act=act, granted=granted)
+        )
+        info = MessageInfo(
+            1, 2, sequence=number, raw=cdr, publish_real_ns=number, receive_real_ns=number, lost=0
+        )
+        node.handle("/operator/act", None, info, Now(0, 0))
+
+    hear(1, "record_stop", granted=False)  # somebody who may not
+    hear(2, "label")
+    with pytest.raises(NodeFinished, match="Ann stopped the recording"):
+        hear(3, "record_stop")
+    node.close()
+    bag = read_messages(tmp_path / "bag")
+    acts = [decode("advnerf_msgs/msg/OperatorAct", message.cdr).act for message in bag]
+    assert acts == ["record_stop", "label", "record_stop"]
 
 
 def test_pictures_are_compressed_without_loss_for_every_reader(tmp_path):
