@@ -23,6 +23,7 @@ from nodes.runtime.messages import drive_message, ns_from_stamp
 from nodes.runtime.node import MessageInfo
 from nodes.runtime.twin_port import claim_twins_port
 from tests.support.safety_reports import state_message
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
 
@@ -97,8 +98,7 @@ def test_motor_obeys_and_reports_the_origin(drives):
     assert not message.braking
     assert message.speed_mps == pytest.approx(0.3, abs=1e-3)
     assert abs(int(message.serial_write_mono_ns) - time.monotonic_ns()) < 60e9
-    time.sleep(0.05)
-    assert drives.names()[-2:] == ["SET_SERVO_POS", "SET_RPM"]
+    wait_for(lambda: drives.names()[-2:] == ["SET_SERVO_POS", "SET_RPM"], "the bytes on the wire")
     assert drives.node.status()[0] == "active"
 
 
@@ -166,8 +166,7 @@ def test_motor_brakes_when_it_is_told_to_end(drives):
     drives.send(0.0, 0.0)
     drives.send(0.5, 0.0)
     drives.node.close()
-    time.sleep(0.05)
-    assert drives.names()[-2:] == ["SET_CURRENT_BRAKE", "SET_CURRENT"]
+    wait_for(lambda: drives.names()[-2:] == ["SET_CURRENT_BRAKE", "SET_CURRENT"], "the bytes on the wire")
 
 
 def test_vehicle_file_reaches_the_driver():
