@@ -118,6 +118,19 @@ def test_a_view_of_the_driving_camera_is_cut_out_of_a_wider_photograph(tmp_path:
         held_out[0].look()
 
 
+def test_a_small_camera_sees_the_mean_of_a_large_photograph(tmp_path: Path) -> None:
+    """As a camera of so few pixels does; single pixels of a meadow or of gravel are noise to a policy."""
+    poses = [planar_pose(0.1 * index, 0.0, 0.0) @ MOUNT for index in range(12)]
+    fine = np.random.default_rng(0).integers(0, 2, (480, 640, 1), np.uint8) * 255 + np.zeros(3, np.uint8)
+    large = Pinhole(640, 480, 400.0, 400.0, 320.0, 240.0)
+    write_posed_images(tmp_path / "images_of_mine", poses, large, lambda _: fine, "png")
+    camera = {"x_m": 0.3, "z_m": 0.2, "pinhole": vars(PINHOLE)}
+    rgb, _ = place(tmp_path, closed=False, camera=camera).photographs(3)[1][0].look()
+    assert rgb.shape == (48, 64, 3)
+    # The mean of 10 x 10 pixels that are black or white.
+    assert rgb.std() == pytest.approx(12.7, rel=0.15)
+
+
 def test_a_leap_ends_a_drive_and_the_longest_part_is_taken() -> None:
     cars = np.stack([planar_pose(0.1 * index, 0.0, 0.0) for index in range(20)])
     elsewhere = np.stack([planar_pose(5.0, 0.1 * index, np.pi / 2) for index in range(8)])

@@ -235,6 +235,14 @@ def _through(pinhole: Pinhole, rgb: Rgb, own: Pinhole, file: Path) -> Rgb:
             f"expected photographs that show all that the driving camera {pinhole} sees, got {file.name} with {own}; take wider ones, or "
             "correct camera.pinhole"
         )
+    smaller = max(pinhole.fx / own.fx, pinhole.fy / own.fy)
+    if (
+        smaller < 1.0
+    ):  # the warp reads four pixels for each of its own: of a larger photograph it would skip the others
+        shrunk = math.ceil(smaller * own.width), math.ceil(smaller * own.height)
+        rgb = np.asarray(cv2.resize(rgb, shrunk, interpolation=cv2.INTER_AREA), np.uint8)
+        own = own.resized(*shrunk)
+        own_from_wanted = own.matrix @ np.linalg.inv(pinhole.matrix)
     # OpenCV counts pixels from their centres.
     index_map = np.linalg.inv(_HALF_PX) @ own_from_wanted @ _HALF_PX
     size = (pinhole.width, pinhole.height)
