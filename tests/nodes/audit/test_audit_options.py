@@ -18,6 +18,7 @@ from advnerf_core.policies.load import load_any_policy
 from advnerf_core.report.audit_result import audit_schema
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
+from nodes.audit.asking import UnansweredError
 from nodes.audit.cars import CARS, car_of
 from nodes.audit.images import posed
 from nodes.audit.places import Answers, AuditedWorld, place_of_photographs
@@ -157,6 +158,19 @@ def test_a_path_from_a_file_takes_ground_and_pitch_from_the_changes_of_the_exper
     place, limit_m = place_of_photographs(*asked, changes)
     assert (place.world["ground_z_m"], place.world["camera"]["pitch_down_rad"]) == (0, 0.1)
     assert (place.world["closed"], limit_m) == (False, 0.4)
+    # Those who took the photographs held the camera elsewhere than the car does.
+    on_ground = replace(there, ground_at_zero=True)
+    with pytest.raises(UnansweredError, match="--camera-height"):
+        place_of_photographs(
+            tmp_path / "photos",
+            on_ground,
+            Answers(0.4, None, None, str(tmp_path / "way.csv")),
+            CARS["donkey"],
+            None,
+            changes,
+        )
+    driven, _ = place_of_photographs(tmp_path / "photos", on_ground, Answers(0.4), CARS["donkey"], None)
+    assert driven.world["camera"]["z_m"] == pytest.approx(0.3)
 
 
 def test_a_learned_scene_without_its_images_cannot_be_judged_in(tmp_path: Path) -> None:
