@@ -217,6 +217,10 @@ def _geometries(files: InputFiles, named: dict[str, bytes]) -> list[Any]:
     try:
         kind = path.suffix.lower().removeprefix(".")
         scene = trimesh.load_scene(io.BytesIO(files.content), file_type=kind, resolver=named)
+        for geometry in scene.geometry.values():
+            # Beside a material they belong to the visual, whose copies lose them.
+            if (colours := getattr(geometry.visual, "vertex_attributes", {}).get("color")) is not None:
+                geometry.vertex_attributes["color"] = colours
         dumped = scene.dump(concatenate=False)
     except Exception as error:  # trimesh's readers raise any exception
         raise MeshError(
@@ -229,7 +233,16 @@ def _part(geometry: Any, path: Path, notes: list[str]) -> MeshPart:
     faces = np.asarray(geometry.faces)
     triangles = np.asarray(geometry.vertices, dtype=np.float64)[faces]
     visual, linear = geometry.visual, path.suffix.lower() in _GLTF
-    uv = getattr(visual, "uv", None)
+    uv, material = getattr(visual, "uv", None), getattr(visual, "material", None)
+    if material is not None and (shades := geometry.vertex_attributes.get("color")) is not None:
+        rgb = _shares(np.asarray(shades)[:, :3])
+        if not _names_an_image(material):
+            rgb = rgb[faces].mean(axis=1) * (_factor(material) if linear else 1.0)
+            return part_from_colours(triangles, _displayed(rgb, linear))
+        if rgb.min() < 1.0:
+            notes.append(
+                f"{path.name} has colours of vertices over a texture; they are left out, so bake them into it"
+            )
     if uv is not None and len(uv) == len(geometry.vertices):
         texture = _texture(visual.material, path, linear, notes)
         return MeshPart(triangles, np.nan_to_num(np.asarray(uv, dtype=np.float64))[faces], texture)
@@ -238,7 +251,6 @@ def _part(geometry: Any, path: Path, notes: list[str]) -> MeshPart:
         colours = np.asarray(visual.vertex_colors)[faces].mean(axis=1)
     if visual.defined and colours is not None and len(colours) == len(faces):
         return part_from_colours(triangles, _displayed(np.asarray(colours)[:, :3] / 255.0, linear))
-    material = getattr(visual, "material", None)
     if _names_an_image(material):
         raise MeshError(
             f"expected texture coordinates for the image of {path}, got none; export it again with them"
@@ -253,10 +265,22 @@ def _names_an_image(material: Any) -> bool:
 def _plain_colour(material: Any, linear: bool) -> Array:
     """A material's colour without an image, in display values; grey without a material."""
     if material is not None and linear:
-        factor = getattr(material, "baseColorFactor", None)
-        return np.ones(3) if factor is None else _displayed(np.asarray(factor)[:3] / 255.0, True)
+        return _displayed(_factor(material), True)
     main = getattr(material, "main_color", None)
     return np.array(_GREY) if main is None else np.asarray(main, np.float64)[:3] / 255.0
+
+
+def _factor(material: Any) -> Array:
+    """The factor ``[3]`` of a glTF material on its colours, in linear light."""
+    factor = getattr(material, "baseColorFactor", None)
+    return np.ones(3) if factor is None else np.asarray(factor, np.float64)[:3] / 255.0
+
+
+def _shares(colours: NDArray[Any]) -> Array:
+    """Colours in 0..1, from whole numbers of any length, or from 0..1 or 0..255."""
+    whole = np.issubdtype(colours.dtype, np.integer)
+    largest = np.iinfo(colours.dtype).max if whole else 255.0 if colours.max(initial=0.0) > 1.0 else 1.0
+    return np.asarray(colours, np.float64) / largest
 
 
 def _texture(material: Any, path: Path, linear: bool, notes: list[str]) -> NDArray[np.float32]:

@@ -89,6 +89,43 @@ def test_a_factor_darkens_a_texture_in_linear_light(tmp_path):
     np.testing.assert_allclose(half.parts[0].texture, 0.537, atol=3e-3)  # a quarter of the light
 
 
+@pytest.mark.parametrize("kind", ["<f4", "u1", "<u2"])
+def test_vertex_colours_count_beside_a_material(tmp_path, kind):
+    """glTF multiplies them with its factor (section 3.7.2.1), as exports of scanners and of Blender have them."""
+    largest = 1.0 if kind == "<f4" else np.iinfo(kind).max
+    colours = np.tile(np.array([[1.0, 0.5, 0.0, 1.0]]) * largest, (3, 1)).astype(kind)
+    buffer = {"uri": "colours.bin", "byteLength": colours.nbytes}
+    (tmp_path / "colours.bin").write_bytes(colours.tobytes())
+
+    def coloured(name, material, image=None):
+        content = json.loads(gltf(tmp_path / name, material, image).read_text())
+        content["buffers"].append(buffer)
+        content["bufferViews"].append({"buffer": 1, "byteOffset": 0, "byteLength": colours.nbytes})
+        component = {"<f4": 5126, "u1": 5121, "<u2": 5123}[kind]
+        content["accessors"].append(
+            {"bufferView": 2, "componentType": component, "count": 3, "type": "VEC4", "normalized": kind != "<f4"}
+        )  # fmt: skip
+        content["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = 2
+        (tmp_path / name).write_text(json.dumps(content))
+        return load_mesh(tmp_path / name)
+
+    plain = coloured("a.gltf", pbr())
+    np.testing.assert_allclose(plain.parts[0].texture[0, 0], [1.0, 0.735, 0.0], atol=3e-3)
+    half = coloured("b.gltf", pbr(baseColorFactor=[0.5, 0.5, 1.0, 1.0]))
+    np.testing.assert_allclose(half.parts[0].texture[0, 0], [0.735, 0.537, 0.0], atol=3e-3)
+    (tmp_path / "t.png").write_bytes(png())
+    (note,) = coloured("c.gltf", pbr(**TEXTURED), "t.png").notes
+    assert "colours of vertices over a texture; they are left out" in note
+
+
+@pytest.mark.parametrize("largest", [1, 255])
+def test_vertex_colours_of_an_obj_count_beside_a_material_without_an_image(tmp_path, largest):
+    rows = "".join(f"v {place} {largest} 0 0\n" for place in ("0 0 0", "1 0 0", "0 0 2"))
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{rows}usemtl m\nf 1 2 3\n")
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd 0.8 0.8 0.8\n")
+    np.testing.assert_allclose(load_mesh(tmp_path / "a.obj", unit="m").parts[0].texture[0, 0], [1, 0, 0])
+
+
 @pytest.mark.skipif(not CASE.exists(), reason="the shared cases are not here")
 def test_a_strangers_glb_stands_and_has_its_colour():
     np.testing.assert_allclose(load_mesh(CASE / "yup.glb").size_m, [0.3, 0.3, 1.0], atol=0.01)
