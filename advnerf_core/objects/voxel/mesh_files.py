@@ -6,6 +6,7 @@ glTF fixes metres, y up and linear colour factors; OBJ, PLY and STL fix none of 
 from __future__ import annotations
 
 import io
+import re
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
@@ -97,6 +98,8 @@ def read_mesh_files(path: Path) -> tuple[InputFiles, dict[str, bytes]]:
     kind = path.suffix.lower()
     if kind == ".obj":
         _read_named_by_obj(files.content, read)
+    elif kind == ".ply":
+        _read_named_by_ply(files.content, read)
     elif kind in _GLTF:
         _read_named_by_gltf(path, files.content, read)
     if problems:
@@ -130,19 +133,30 @@ def _read_named_by_obj(content: bytes, read: _Read) -> None:
             continue
         library = _name(words[1:])
         for line in _lines(read(library, library)):
-            if line[0] in ("map_Kd", "map_Ka") and len(line) > 1:
+            if line[0].lower() in ("map_kd", "map_ka") and len(line) > 1:
                 image = _name(line[1:])
                 read(image, (PurePosixPath(library.replace("\\", "/")).parent / image).as_posix())
 
 
+def _read_named_by_ply(content: bytes, read: _Read) -> None:
+    header = content.partition(b"end_header")[0].decode(errors="replace")
+    for image in re.findall(r"^comment\s+TextureFile\s+(.+?)\s*$", header, re.I | re.M):
+        read(image, image)
+
+
 def _name(words: list[str]) -> str:
-    """A named file: all words, or the last one after options."""
-    return words[-1] if words[0].startswith("-") else " ".join(words)
+    """A named file. Options before it, which move or scale the image, are not read."""
+    if words[0].startswith("-"):
+        raise MeshError(
+            f"expected the name of an image alone in the materials, got {' '.join(words)}; remove the options if they change nothing, or export the "
+            "mesh as one GLB"
+        )
+    return " ".join(words)
 
 
 def _lines(content: bytes) -> Iterator[list[str]]:
     for line in content.decode(errors="replace").splitlines():
-        if line.lstrip().startswith(("mtllib", "map_")):
+        if line.lstrip().lower().startswith(("mtllib", "map_")):
             yield line.split()
 
 

@@ -214,6 +214,37 @@ def test_named_files_elsewhere_or_behind_a_link_are_refused(tmp_path):
             load_mesh(gltf(folder / "a.gltf", pbr(**TEXTURED), name))
 
 
+@pytest.mark.parametrize("places", ["of corners", "of vertices"])
+def test_a_ply_has_the_texture_that_its_header_names(tmp_path, places):
+    """As MeshLab and photogrammetry write it."""
+    of_corners = places == "of corners"
+    vertices, face = ["0 0 0", "1 0 0", "0 0 2"], "3 0 1 2"
+    if not of_corners:
+        vertices = [f"{place} {u} {v}" for place, (u, v) in zip(vertices, UV, strict=True)]
+    own = "" if of_corners else "property float s\nproperty float t\n"
+    faces = "property list uchar float texcoord\n" if of_corners else ""
+    (tmp_path / "a.ply").write_text(
+        "ply\nformat ascii 1.0\ncomment TextureFile my texture.png\nelement vertex 3\nproperty float x\nproperty float y\n"
+        f"property float z\n{own}element face 2\nproperty list uchar int vertex_indices\n{faces}end_header\n"
+        + "\n".join([*vertices, *[face + " 6 0 0 1 0 0 1" * of_corners] * 2, ""])
+    )
+    with pytest.raises(MeshError, match=r"refers to my texture\.png, .*No such file"):
+        load_mesh(tmp_path / "a.ply", unit="m")
+    (tmp_path / "my texture.png").write_bytes(png())
+    mesh = load_mesh(tmp_path / "a.ply", unit="m")
+    np.testing.assert_allclose(255 * mesh.parts[0].texture[0, 0], [10, 200, 30], atol=0.5)
+    np.testing.assert_allclose(mesh.parts[0].uv[0], UV)
+    assert list(read_mesh_files(tmp_path / "a.ply")[0].others) == ["my texture.png"]
+
+
+def test_options_of_an_image_are_refused_and_its_key_may_be_in_any_case(tmp_path):
+    (tmp_path / "t.png").write_bytes(png())
+    with pytest.raises(MeshError, match=r"name of an image alone .*, got -s 2 2 1 t\.png; remove"):
+        load_mesh(obj(tmp_path, material="map_Kd -s 2 2 1 t.png"), unit="m")
+    texture = load_mesh(obj(tmp_path, material="MAP_KD t.png"), unit="m").parts[0].texture
+    np.testing.assert_allclose(255 * texture[0, 0], [10, 200, 30], atol=0.5)
+
+
 def test_a_mesh_is_made_of_what_was_hashed(tmp_path, monkeypatch):
     """A file that changes while the mesh is read: image and hash are of the same content."""
     path = obj(tmp_path)
