@@ -82,22 +82,33 @@ def footprint_m(kind: str) -> tuple[float, float]:
     return extent_m(kind)[:2]
 
 
-def extent_m(kind: str) -> tuple[float, float, float]:
+def extent_m(
+    kind: str, up: str | None = None, height_m: float | None = None, unit: str | None = None
+) -> tuple[float, float, float]:
     """Length, width and height [m] of an object of a kind at scale 1, about the axis that it turns around.
+
+    Args:
+        up: Up axis of a mesh's file.
+        height_m: Height to which it is scaled [m].
+        unit: Unit of a mesh's file.
 
     Raises:
         MeshError, ObjectFileError: The file cannot be read.
     """
     if kind in MADE_HERE_M:
-        return MADE_HERE_M[kind]
-    return _extent_m(kind, Path(kind).stat().st_mtime_ns)
+        length, width, height = MADE_HERE_M[kind]
+        factor = 1.0 if height_m is None else height_m / height
+        return factor * length, factor * width, factor * height
+    return _extent_m(kind, Path(kind).stat().st_mtime_ns, up, height_m, unit)
 
 
 @lru_cache(maxsize=16)
-def _extent_m(kind: str, changed_ns: int) -> tuple[float, float, float]:
+def _extent_m(
+    kind: str, changed_ns: int, up: str | None, height_m: float | None, unit: str | None
+) -> tuple[float, float, float]:
     del changed_ns  # part of the cache's key
     if is_mesh(kind):
-        low, high = load_mesh_of(kind).box
+        low, high = load_mesh_of(kind, up, height_m, unit).box
     else:
         from advnerf_core.objects.voxel.model import load_object
 
@@ -107,12 +118,14 @@ def _extent_m(kind: str, changed_ns: int) -> tuple[float, float, float]:
     return float(length), float(width), float(high[2] - low[2])
 
 
-def load_mesh_of(kind: str) -> SurfaceMesh:
-    """A user's mesh: upright, its base on the ground.
+def load_mesh_of(
+    kind: str, up: str | None = None, height_m: float | None = None, unit: str | None = None
+) -> SurfaceMesh:
+    """A user's mesh: upright, its base on the ground; see `load_mesh`.
 
     Raises:
         MeshError: The mesh cannot be read.
     """
     from advnerf_core.objects.voxel.mesh_files import load_mesh
 
-    return load_mesh(Path(kind))
+    return load_mesh(Path(kind), up, height_m, unit)

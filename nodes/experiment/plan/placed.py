@@ -19,12 +19,13 @@ from nodes.experiment.plan.numbers import Length, Unit
 from nodes.experiment.plan.object_kinds import (
     BALL,
     CUBE,
+    MADE_HERE_M,
     MESH_SUFFIXES,
     OBJECT_SUFFIX,
     PANEL,
     UNITLESS_SUFFIXES,
     ObjectKind,
-    footprint_m,
+    extent_m,
     name_of,
 )
 from nodes.lab.located import NamedFile
@@ -187,9 +188,19 @@ class PlacedObject(StrictModel):
         return self.model_dump(mode="json", include=_PLACE) | short
 
     @property
+    def footprint_m(self) -> tuple[float, float]:
+        """Length and width [m] of the ground that it covers."""
+        if self.face is not None:
+            length = self.face.size_m if self.kind == CUBE else MADE_HERE_M[PANEL][0]
+            return self.scale * length, self.scale * self.face.size_m
+        mesh = self.mesh or MeshConfig()
+        length, width, _ = extent_m(self.kind, mesh.up, mesh.height_m, mesh.unit)
+        return self.scale * length, self.scale * width
+
+    @property
     def side_m(self) -> float:
         """Width [m]; for a panel also its height."""
-        return self.scale * (footprint_m(self.kind)[1] if self.face is None else self.face.size_m)
+        return self.footprint_m[1]
 
     @property
     def T_world_from_face(self) -> Array:
@@ -208,7 +219,7 @@ class PlacedObject(StrictModel):
 
     def corners_m(self) -> list[tuple[float, float]]:
         """The four corners [m] of the ground it covers."""
-        length, width = (0.5 * self.scale * size for size in footprint_m(self.kind))
+        length, width = (0.5 * size for size in self.footprint_m)
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
         ends = [(a * length, b * width) for a, b in signs]
@@ -292,7 +303,7 @@ def in_a_lane(objects: Sequence[PlacedObject], world: WorldDescription) -> tuple
     for index, thing in enumerate(objects):
         turned, half = (
             rotation_z(thing.yaw_rad)[:2, :2],
-            0.5 * thing.scale * np.array(footprint_m(thing.kind)),
+            0.5 * np.array(thing.footprint_m),
         )
         seen_from_it = (middles - [thing.x_m, thing.y_m]) @ turned
         nearest = np.clip(seen_from_it, -half, half)  # within the ground that it covers

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from pydantic import ValidationError
 
 from advnerf_core.geometry import invert_transform, planar_pose
@@ -40,6 +41,30 @@ def test_object_sizes_are_those_of_the_generated_meshes() -> None:
         assert (covered >= 0.8 * size).all()
         assert low[2] == pytest.approx(0.0, abs=0.01)
         assert high[2] == pytest.approx(MADE_HERE_M[kind][2])
+
+
+def test_the_ground_that_an_object_covers_is_that_of_its_own_size(tmp_path: Path) -> None:
+    """The report draws it, of what a learned scene alone takes as well."""
+    trimesh.creation.box((200.0, 100.0, 400.0)).export(tmp_path / "box.stl")
+
+    def covered_m(kind: str, **own: object) -> tuple[float, float]:
+        corners = np.array(
+            PlacedObject.model_validate(
+                {"name": "one", "kind": kind, "x_m": 1.0, "y_m": 2.0} | own
+            ).corners_m()
+        )
+        np.testing.assert_allclose(corners.mean(axis=0), [1.0, 2.0])
+        length, width = np.ptp(corners, axis=0)
+        return float(length), float(width)
+
+    file = str(tmp_path / "box.stl")
+    assert covered_m(file, mesh={"unit": "mm"}, scale=2.0) == pytest.approx((0.4, 0.2))
+    assert covered_m(file, mesh={"height_m": 0.8}) == pytest.approx((0.4, 0.2))
+    assert covered_m(file, mesh={"height_m": 0.8, "up": "y"}) == pytest.approx((1.6, 3.2))
+    assert covered_m("hydrant", mesh={"height_m": 1.5}) == pytest.approx((0.96, 0.96))
+    assert covered_m("ball", mesh={"height_m": 0.35}) == pytest.approx((0.35, 0.35))
+    assert covered_m("panel", face={"size_m": 0.5}, scale=2.0) == pytest.approx((0.2, 1.0))
+    assert covered_m("cube", face={"size_m": 0.5}) == pytest.approx((0.5, 0.5))
 
 
 def test_five_objects_stand_clear_of_every_lane(experiment: Experiment) -> None:
