@@ -48,6 +48,12 @@ def _scale(node: Any, constants: dict[str, Any]) -> float | None:
     ):
         return None
     largest = float(np.abs(values[0]).max(initial=0.0))
+    normalises = node.op_type == "BatchNormalization"
+    # Images whose mean is below 0 were scaled before the network; a factor of 1 or a shift by 0 says nothing.
+    if (normalises and values[0].min(initial=0.0) < 0.0) or (
+        not normalises and largest == (0.0 if node.op_type in ("Sub", "Add") else 1.0)
+    ):
+        return None
     if node.op_type == "Mul":
         largest = 1.0 / largest if largest > 0.0 else 0.0
     return 255.0 if largest > _LARGEST_OF_ONE else 1.0

@@ -147,10 +147,31 @@ def scaled(folder, layers):
         ([("Sub", [[[0.485]], [[0.456]], [[0.406]]]), ("Div", 0.22)], 1.0),
         ([("Mul", 2.0), ("Sub", 1.0)], 1.0),
         ([], None),
+        ([("Div", 1.0)], None),
+        ([("Add", 0.0)], None),
     ],
 )
 def test_a_network_that_scales_its_images_says_their_range(tmp_path, layers, value_max):
     contract, questions = guess_contract(scaled(tmp_path, layers))
+    assert contract.value_max == (value_max or 1.0)
+    assert ("value_max" in {each.key for each in questions}) == (value_max is None)
+
+
+@pytest.mark.parametrize(
+    ("means", "value_max"),
+    [((110.0, 104.0, 90.0), 255.0), ((0.45, 0.42, 0.38), 1.0), ((0.04, -0.03, 0.01), None)],
+)
+def test_a_normalisation_says_the_range_unless_the_images_were_centred_before(tmp_path, means, value_max):
+    weights = {name: np.ones(3, np.float32) for name in ("scale", "bias", "variance")}
+    weights["mean"] = np.array(means, np.float32)
+    nodes = [
+        ("BatchNormalization", ["images", "scale", "bias", "mean", "variance"], ["first"], {}),
+        ("ReduceMean", ["first"], ["steering"], {"axes": [1, 2, 3], "keepdims": 0}),
+    ]
+    file = tmp_path / "policy.onnx"
+    shapes = {"images": (FLOAT, ["B", 3, 8, 12])}, {"steering": (FLOAT, ["B"])}
+    onnx.save(network_model(nodes, *shapes, weights), file)
+    contract, questions = guess_contract(file)
     assert contract.value_max == (value_max or 1.0)
     assert ("value_max" in {each.key for each in questions}) == (value_max is None)
 
