@@ -170,6 +170,13 @@ def _read_named_by_gltf(path: Path, content: bytes, read: _Read) -> None:
         raise MeshError(
             f"expected a mesh without the glTF extension {', '.join({*required, *used})}, got {path}; export it again without it"
         )
+    for material in header.get("materials", []):
+        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
+        if texture.get("texCoord", 0) != 0:
+            raise MeshError(
+                f"expected colours by the first texture coordinates (texCoord 0) in {path}, got texCoord {texture['texCoord']}; make these the first "
+                "UV map, and export it again"
+            )
     entries = [*header.get("images", []), *header.get("buffers", [])]
     for name in (str(entry["uri"]) for entry in entries if "uri" in entry):
         if not name.startswith("data:"):

@@ -304,6 +304,13 @@ def test_an_extension_that_changes_the_picture_is_named(tmp_path, key):
     load_mesh(gltf(tmp_path / "b.gltf", pbr(), **{key: ["KHR_materials_unlit"]}))
 
 
+def test_a_texture_by_other_coordinates_than_the_first_is_refused(tmp_path):
+    (tmp_path / "t.png").write_bytes(png())
+    path = gltf(tmp_path / "a.gltf", pbr(baseColorTexture={"index": 0, "texCoord": 1}), "t.png")
+    with pytest.raises(MeshError, match=r"first texture coordinates .*, got texCoord 1; make these"):
+        load_mesh(path)
+
+
 def test_glb_headers_that_lie_are_one_error(tmp_path):
     for content in (b"glTF", b"glTF" + struct.pack("<IIII", 2, 20, 1 << 30, 0), b"[]", b""):
         (tmp_path / "a.glb").write_bytes(content)
