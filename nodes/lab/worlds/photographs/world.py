@@ -236,9 +236,8 @@ def _through(pinhole: Pinhole, rgb: Rgb, own: Pinhole, file: Path) -> Rgb:
             "correct camera.pinhole"
         )
     smaller = max(pinhole.fx / own.fx, pinhole.fy / own.fy)
-    if (
-        smaller < 1.0
-    ):  # the warp reads four pixels for each of its own: of a larger photograph it would skip the others
+    # The warp reads four pixels for each of its own: of a larger photograph it would skip the others.
+    if smaller < 1.0:
         shrunk = math.ceil(smaller * own.width), math.ceil(smaller * own.height)
         rgb = np.asarray(cv2.resize(rgb, shrunk, interpolation=cv2.INTER_AREA), np.uint8)
         own = own.resized(*shrunk)
