@@ -85,8 +85,11 @@ def test_queue_topic_keeps_all_in_order_and_counts_what_was_lost_on_the_way(tmp_
         got = []
         for i in range(100):
             sender.publish("/vicon/car", pose_message(np.eye(4), i))
-            if i % 10 == 9:  # fewer than a sender keeps
-                got += receive(receiver, 10)
+            # ZeroMQ's sender keeps 16, and hears within about 3 ms, in eights, what has been taken (socket_base.cpp, pipe.cpp).
+            if i % 8 == 7:
+                got += receive(receiver, 8)
+                time.sleep(0.01)
+        got += receive(receiver, 4)
         assert [g.info.sequence for g in got] == list(range(100))
         big = pose_message(np.eye(4), 0, "f" * 20_000)
         for _ in range(2000):
