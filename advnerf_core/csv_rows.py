@@ -6,6 +6,7 @@ import csv
 import io
 import itertools
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,16 +57,18 @@ def read_csv(
     reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     rows: list[CsvRow] = []
     problems: list[str] = []
+    lengths: Counter[int] = Counter()
     began = 1
     try:
         first = next(reader, [])
         is_bare = bool(bare) and len(first) == len(bare) and is_real(first[-1].strip())
         names = list(bare) if is_bare else [name.strip() for name in first]
         _require_commas(path, names, columns)
-        problems += _header_problems(path, names, columns, cure)
+        raise_problems(_header_problems(path, names, columns, cure))
         began = reader.line_num + 1
         for values in itertools.chain([first] if is_bare else [], reader):
             place = f"{path}:{reader.line_num}"
+            lengths[len(values)] += 1
             if len(values) not in (0, len(names)):
                 problems.append(
                     f"{place}: expected {len(names)} fields as in the header, got {len(values)}; "
@@ -77,6 +80,12 @@ def read_csv(
     except csv.Error as error:
         problems.append(
             f"{path}:{began}: expected valid CSV: {error}; close each quote at the end of its field, or remove it"
+        )
+    del lengths[0]  # empty lines
+    if not rows and len(lengths) == 1 and lengths.total() == len(problems) > 1:
+        raise ConfigError(
+            f"{path}:1: expected a header of {next(iter(lengths))} fields as in every row, got {len(names)}: {', '.join(names):.80}; remove "
+            "lines before the header, and write numbers with a decimal point"
         )
     raise_problems(problems)
     return rows

@@ -189,6 +189,7 @@ def written(tmp_path, text):
         ("a;b\n1;0,2\n3;0,4\n", r"^[^\n]*:1: [^\n]*; separate the columns by commas, and write numbers with a decimal point$"),
         ("a\tb\n1\t0,2\n", r":1: .*; separate the columns by commas"),
         ("a,c\n1,2\n", r"log\.csv:1: expected columns a, b, got a, c; correct the header"),
+        ("# my drive\na,b\n1,2\n3,4\n", r"^[^\n]*log\.csv:1: expected columns a, b, got # my drive; correct the header$"),
         ("", "got an empty file"),
         ('a,b\n1,2\n1,"2\n3,4\n', r"log\.csv:3: expected valid CSV: .*; close each quote"),
         ('a,b\n"x,1\n"y,2\n', r"log\.csv:2: expected valid CSV: .*; close each quote"),
@@ -197,6 +198,12 @@ def written(tmp_path, text):
 def test_every_mistake_of_a_csv_file_has_its_line(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message):
         read_csv(written(tmp_path, text), ["a", "b"])
+
+
+def test_a_line_before_the_header_is_told_once(tmp_path):
+    said = r"^[^\n]*log\.csv:1: expected a header of 2 fields as in every row, got 1: # my drive; remove lines before the header[^\n]*$"
+    with pytest.raises(ConfigError, match=said):
+        read_csv(written(tmp_path, "# my drive\n\na,b\n1,2\n3,4\n"))
 
 
 def test_rows_have_numbers_and_their_place(tmp_path):
