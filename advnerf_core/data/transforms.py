@@ -289,9 +289,21 @@ def _says_something(value: Any) -> bool:
 
 
 def _without_other_focal_lengths(content: _Values, entry: _Values) -> _Values:
-    """The file's values without focal lengths in another form than the frame's, which would go before the frame's own."""
+    """The file's values without focal lengths in another form than the frame's, which would go before the frame's own.
+
+    Raises:
+        ValueError: The frame has the focal length of one axis, and the file that of the other, so of another lens: pixels would be stretched.
+    """
     form = next((keys for keys in _FOCAL_FORMS if any(entry.get(key) is not None for key in keys)), None)
-    others = {key for keys in _FOCAL_FORMS if form not in (None, keys) for key in keys}
+    if form is None:
+        return content
+    for own, other in (form, form[::-1]):
+        if entry.get(other) is None and content.get(other) is not None:
+            raise ValueError(
+                f"{own}: expected {form[0]} and {form[1]} of one lens, got {own} = {entry[own]!r:.40} of the frame and {other} = "
+                f"{content[other]!r:.40} of the file; give the frame {other} too, or take {other} out of the file"
+            )
+    others = {key for keys in _FOCAL_FORMS if keys != form for key in keys}
     return {key: value for key, value in content.items() if key not in others}
 
 

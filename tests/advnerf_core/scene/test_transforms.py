@@ -112,12 +112,26 @@ def test_fields_of_view_in_degrees_and_of_both_axes(tmp_path):
 
 def test_a_focal_length_of_a_frame_goes_before_one_of_the_file_in_another_form(tmp_path):
     """Two of three frames have another lens; the file's fl_x and fl_y are those of the third."""
-    own = [{}, {"camera_angle_x": np.pi / 2}, {"fl_x": 50.0}]
+    own = [{}, {"camera_angle_x": np.pi / 2}, {"fl_x": 50.0, "fl_y": 52.0}]
     frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k), **each} for k, each in enumerate(own)]
     file, wide = write(tmp_path, frames, fl_y=31.0), WIDTH / 2
     fl_x = json.loads(file.read_text())["fl_x"]
     found = [(each.pinhole.fx, each.pinhole.fy) for each in load_transforms(file).frames]
-    assert found == [(fl_x, 31.0), (pytest.approx(wide), pytest.approx(wide)), (50.0, 31.0)]
+    assert found == [(fl_x, 31.0), (pytest.approx(wide), pytest.approx(wide)), (50.0, 52.0)]
+
+
+@pytest.mark.parametrize(
+    ("own", "common"),
+    [("fl_x", "fl_y"), ("fl_y", "fl_x"), ("camera_angle_x", "camera_angle_y"), ("x_fov", "y_fov")],
+)
+def test_a_focal_length_of_a_frame_is_not_joined_with_the_files_for_the_other_axis(tmp_path, own, common):
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in range(2)]
+    frames[1][own] = 50.0 if own.startswith("fl") else 1.5
+    file = write(tmp_path, frames, **{common: 31.0 if own.startswith("fl") else 1.2})
+    with pytest.raises(
+        DatasetError, match=rf"frame 1 \(1\.png\): {own}: expected .* of one lens, got .* {common} too"
+    ):
+        load_transforms(file)
 
 
 def test_cameras_of_one_set_keep_their_own_intrinsics_and_names(tmp_path):
