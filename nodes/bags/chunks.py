@@ -54,30 +54,52 @@ def messages_in_order(
         channels = block.message_index_offsets
         if block.message_end_time < start_ns or (channels and names.keys().isdisjoint(channels)):
             continue
-        try:
-            data = _run_data(file, block) if isinstance(block, MessageRun) else _chunk_data(file, block)
-            for at, channel_id, message in _messages(data, names):
-                if message.log_ns >= start_ns:
-                    heappush(waiting, (message.log_ns, block.chunk_start_offset, at, channel_id, message))
-        except Damaged as error:
-            raise _damaged(file.name, summary, block, error) from error
+        for at, channel_id, message in _block_messages(file, summary, block, names):
+            if message.log_ns >= start_ns:
+                heappush(waiting, (message.log_ns, block.chunk_start_offset, at, channel_id, message))
     while waiting:
         yield heappop(waiting)[3:]
 
 
 def time_spans(summary: FileSummary) -> list[tuple[int, int]]:
-    """Log times of the first and last message of each chunk, and of each run of messages outside chunks [ns since 1970]."""
+    """Log times of the first and last message of each chunk, and of each run of messages outside chunks, as written [ns since 1970]."""
     return [
         (block.message_start_time, block.message_end_time)
-        for block in _blocks(summary)
+        for block in _as_written(summary)
         if block.message_index_offsets or block.message_end_time
     ]
 
 
+def times_as_written(file: BinaryIO, summary: FileSummary) -> Iterator[tuple[str, int]]:
+    """Yield topic and log time [ns since 1970] of all messages in the order in which they were written.
+
+    Raises:
+        BagError: A chunk is damaged. The messages before it have already been yielded.
+    """
+    names = {number: channel.topic for number, channel in summary.channels.items()}
+    for block in _as_written(summary):
+        for _, _, message in _block_messages(file, summary, block, names):
+            yield message.topic, message.log_ns
+
+
+def _as_written(summary: FileSummary) -> list[Block]:
+    blocks: list[Block] = [*summary.chunk_indexes, *summary.runs]
+    return sorted(blocks, key=lambda block: block.chunk_start_offset)
+
+
 def _blocks(summary: FileSummary) -> list[Block]:
     """The chunks, and the runs of messages outside chunks, in order of their first log time."""
-    blocks: list[Block] = [*summary.chunk_indexes, *summary.runs]
-    return sorted(blocks, key=lambda block: (block.message_start_time, block.chunk_start_offset))
+    return sorted(_as_written(summary), key=lambda block: block.message_start_time)
+
+
+def _block_messages(
+    file: BinaryIO, summary: FileSummary, block: Block, names: Mapping[int, str]
+) -> Iterator[tuple[int, int, BagMessage]]:
+    try:
+        data = _run_data(file, block) if isinstance(block, MessageRun) else _chunk_data(file, block)
+        yield from _messages(data, names)
+    except Damaged as error:
+        raise _damaged(file.name, summary, block, error) from error
 
 
 def _damaged(path: str, summary: FileSummary, block: Block, error: Damaged) -> BagError:

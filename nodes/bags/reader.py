@@ -14,7 +14,13 @@ from mcap.records import Channel
 
 from advnerf_core.files import is_plain_name, write_atomically
 from nodes.bags.check import diagnose
-from nodes.bags.chunks import messages_in_order, read_attachment_at, read_metadata_at, time_spans
+from nodes.bags.chunks import (
+    messages_in_order,
+    read_attachment_at,
+    read_metadata_at,
+    time_spans,
+    times_as_written,
+)
 from nodes.bags.file import open_bag
 from nodes.bags.foreign import read_stored, stored_messages
 from nodes.bags.formats import BagFormat, recognise
@@ -59,13 +65,21 @@ def has_publish_times(bag: Path) -> bool:
 
 
 def message_spans(bag: Path) -> list[tuple[int, int]]:
-    """Spans of log time that cover all messages, from the index of the bag [ns since 1970]."""
+    """Spans of log time that cover all messages, from the index of the bag, as written [ns since 1970]."""
     spans: list[tuple[int, int]] = []
     for part in _parts(bag):
         if part.messages:
             whole = [(part.start_ns, part.end_ns)]
             spans += time_spans(_whole_file(part.path)) if part.format is BagFormat.MCAP else whole
     return spans
+
+
+def read_times_as_written(bag: Path) -> Iterator[tuple[str, int]]:
+    """Yield topic and log time [ns since 1970] of all messages as written. Other formats than MCAP do not say that order: theirs are left out."""
+    for part in _parts(bag):
+        if part.format is BagFormat.MCAP:
+            with open_bag(part.path) as file:
+                yield from times_as_written(file, _whole_file(part.path))
 
 
 def read_attachment(bag: Path, name: str) -> bytes:

@@ -6,15 +6,18 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 
-from nodes.bags.reader import message_spans, read_messages
+from nodes.bags.reader import message_spans, read_messages, read_times_as_written
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
 
 # A running stack sends statuses every second. No recording is silent for an hour.
 LONGEST_SILENCE_S = 3600.0
+# A recorder writes the messages of a topic as it receives them.
+_MOST_BACK_S = 1.0
+SET_BACK = "the recorder's clock was set back, and messages are read in the order of log time, not of the drive; record the drive again"
 _UNITS = (("year", 365.25 * 86400.0), ("day", 86400.0), ("hour", 3600.0))
 
 
@@ -59,6 +62,28 @@ def read_gaps(bag: Path) -> tuple[TimeGap, ...]:
     return ()
 
 
+def read_steps_back(bag: Path) -> tuple[str, ...]:
+    """Say where the log time of a topic goes back as it was written: the recorder's clock was set back. Read only if the index leaves room for it."""
+    limit_ns = _MOST_BACK_S * NS_PER_S
+    spans = message_spans(bag)
+    ends_ns = accumulate((last_ns for _, last_ns in spans), max)
+    if all(last_ns - first_ns <= limit_ns for first_ns, last_ns in spans) and all(
+        end_ns - after[0] <= limit_ns for end_ns, after in zip(ends_ns, spans[1:], strict=False)
+    ):
+        return ()
+    found: list[str] = []
+    latest_ns: dict[str, int] = {}
+    for count, (topic, log_ns) in enumerate(read_times_as_written(bag)):
+        back_ns = latest_ns.get(topic, log_ns) - log_ns
+        if back_ns > limit_ns:
+            found.append(
+                f"log time goes back by {back_ns / NS_PER_S:.0f} s after message {count} as recorded"
+            )
+            latest_ns.clear()
+        latest_ns[topic] = max(log_ns, latest_ns.get(topic, log_ns))
+    return tuple(found)
+
+
 def require_order(bag: Path, topic: str, numbers: Sequence[int]) -> None:
     """Refuse a topic whose messages lie in another order than they were published in: the recorder's clock was set back while it ran.
 
@@ -78,14 +103,20 @@ def require_order(bag: Path, topic: str, numbers: Sequence[int]) -> None:
 def skipped_gaps(bag: Path) -> tuple[TimeGap, ...]:
     """Find the gaps of a bag for a reader that skips them, and name them once on standard error."""
     gaps = read_gaps(bag)
-    _say(bag, gaps)
+    _say(
+        bag,
+        (
+            *(f"{gap}; this time is skipped" for gap in gaps),
+            *(f"{step}; {SET_BACK}" for step in read_steps_back(bag)),
+        ),
+    )
     return gaps
 
 
 @lru_cache(maxsize=64)
-def _say(bag: Path, gaps: tuple[TimeGap, ...]) -> None:
-    for gap in gaps:
-        print(f"{bag}: {gap}; this time is skipped", file=sys.stderr, flush=True)
+def _say(bag: Path, lines: tuple[str, ...]) -> None:
+    for line in lines:
+        print(f"{bag}: {line}", file=sys.stderr, flush=True)
 
 
 def silence_s(gaps: Sequence[TimeGap]) -> float:

@@ -42,7 +42,7 @@ def bag_info(
     from nodes.bags.check import diagnose
     from nodes.bags.parts import bag_parts
     from nodes.bags.reader import read_info
-    from nodes.bags.time_gaps import read_gaps, silence_s
+    from nodes.bags.time_gaps import SET_BACK, read_gaps, read_steps_back, silence_s
 
     if not quick:
         for part in bag_parts(bag):
@@ -60,6 +60,8 @@ def bag_info(
     )
     for gap in gaps:
         print(f"{gap}: the recorder's clock was set; replay, play and evaluate skip this time")
+    for step in read_steps_back(bag):
+        print(f"{step}: {SET_BACK}")
     for key, value in info.metadata.items():
         print(f"{key}: {value}")
     print(f"attachments: {', '.join(info.attachments) or 'none'}")

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import pytest
@@ -6,7 +7,7 @@ from advnerf_core.driving.metrics import Horizon
 from nodes.bags.play import Playhead
 from nodes.bags.reader import read_attachments, read_messages
 from nodes.bags.stamps import read_delays
-from nodes.bags.time_gaps import LONGEST_SILENCE_S, TimeGap, find_gaps, read_gaps, silence_s
+from nodes.bags.time_gaps import LONGEST_SILENCE_S, TimeGap, find_gaps, read_gaps, read_steps_back, silence_s
 from nodes.bags.writer import BagWriter
 from nodes.lab.trials.evaluation import trajectory
 from nodes.player import PlayerConfig, PlayerNode
@@ -123,6 +124,18 @@ def test_info_names_the_gap(tmp_path, monkeypatch, capsys):
     shown = capsys.readouterr().out
     assert "log time jumps by 57 years after message 5" in shown
     assert "132 messages in 1." in shown
+
+
+@pytest.mark.parametrize("back_s", [2, 300, 1000])
+def test_a_clock_that_was_set_back_is_named(tmp_path, monkeypatch, capfd, back_s):
+    bag = shifted(tmp_path / "bag", lambda number, log_ns: log_ns - back_s * NS * (number > 70))
+    (step,) = read_steps_back(bag)
+    assert re.fullmatch(rf"log time goes back by {back_s} s after message 7\d as recorded", step)
+    assert read_steps_back(CORNER) == ()
+    assert not advnerf(monkeypatch, "bag", "info", str(bag))
+    assert f"{step}: the recorder's clock was set back" in capfd.readouterr().out
+    digest_and_length(bag)
+    assert f"{bag}: {step}; the recorder's clock was set back" in capfd.readouterr().err
 
 
 def test_a_recorder_whose_clock_was_set_back_is_told_as_its_messages_are_mixed(tmp_path):
