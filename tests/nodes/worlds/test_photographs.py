@@ -204,6 +204,26 @@ def test_a_frame_without_z_up_is_refused(tmp_path: Path, up: str) -> None:
         place(tmp_path).describe()
 
 
+@pytest.mark.parametrize("laps", [0.98, 1.02, 1.3, 2.0, 2.4])
+def test_a_drive_of_more_than_a_lap_is_cut_to_one(laps: float) -> None:
+    angle_rad = np.arange(0.0, 2.0 * np.pi * laps, 0.04)
+    points = 2.0 * np.column_stack([np.cos(angle_rad), np.sin(angle_rad)])
+    noise = np.random.default_rng(0).normal(0.0, 0.004, points.shape)
+    path = as_path(path_along(points + noise, 0.25, True))
+    assert path.length_m == pytest.approx(4.0 * np.pi, rel=0.01)
+    assert np.hypot(*path.pose_at(np.linspace(0.0, path.length_m, 99))[:, :2].T) == pytest.approx(
+        2.0, abs=0.02
+    )
+
+
+def test_a_way_that_passes_its_first_point_twice_is_not_cut() -> None:
+    """Two loops one behind the other, a large and a small one, which touch where they begin."""
+    angle_rad = np.arange(0.02, 2.0 * np.pi, 0.04)
+    loops = [r * np.column_stack([np.sin(angle_rad), 1.0 - np.cos(angle_rad)]) for r in (2.0, 1.5)]
+    path = path_along(np.concatenate(loops), 0.25, True)
+    assert path.length_m == pytest.approx(7.0 * np.pi, rel=0.01)
+
+
 def test_an_open_path_from_a_file(tmp_path: Path) -> None:
     photographs(tmp_path / "images_of_mine", count=12)
     file = tmp_path / "way.csv"

@@ -86,7 +86,7 @@ def path_along(points: Array, off_track_m: float, closed: bool) -> ReferencePath
     Args:
         points: x [m], y [m] ``[N, 2]`` in driving order.
         off_track_m: Half the width of the lane [m].
-        closed: Whether it continues from the last point to the first.
+        closed: Whether it continues from the last point to the first. A second lap, or the beginning of one, is left out.
 
     Raises:
         WorldError: The points do not form a smooth route.
@@ -95,6 +95,7 @@ def path_along(points: Array, off_track_m: float, closed: bool) -> ReferencePath
         raise WorldError(
             f"expected at least {_FEWEST} points along the path, got {len(points)}; put more between them"
         )
+    points = _one_lap(points, off_track_m) if closed else points
     try:
         averaged = _averaged(points, _SPACING * off_track_m, closed)
         steps = np.diff(averaged, axis=0)
@@ -109,6 +110,21 @@ def path_along(points: Array, off_track_m: float, closed: bool) -> ReferencePath
             f"expected points on one smooth way, at most {_SPACING * off_track_m:g} m apart ({_SPACING:g} of off_track_m), "
             f"got {len(points)} points: {error}"
         ) from None
+
+
+def _one_lap(points: Array, near_m: float) -> Array:
+    """The points ``[N, 2]`` up to where they pass the first one again in its direction, if all later ones lie on the beginning."""
+    from_first = points - points[0]
+    away_m = np.linalg.norm(from_first, axis=1)
+    ahead = from_first[int(np.argmax(away_m > near_m))]
+    has_left = np.maximum.accumulate(away_m) > 2.0 * near_m
+    onward = np.diff(points, axis=0, prepend=points[:1]) @ ahead > 0.0
+    again = np.flatnonzero(has_left & onward & (away_m <= near_m) & (from_first @ ahead > 0.0))
+    if not again.size:
+        return points
+    lap, later = np.split(points, again[:1])
+    is_on_lap = np.linalg.norm(later[:, None] - lap[None], axis=2).min(axis=1) <= near_m
+    return lap if is_on_lap.all() else points
 
 
 def _averaged(points: Array, spacing_m: float, closed: bool) -> Array:
