@@ -113,14 +113,17 @@ def _times_repeat(rows: Sequence[CsvRow]) -> bool:
 
 
 def _time(text: str) -> float:
-    """A number, or a date and time; NaN for anything else."""
+    """A number, a date and time, or a time of day; NaN for anything else."""
     text = text.strip()
-    try:
-        return (
-            float(text) if is_real(text) else datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp()
-        )
-    except (ValueError, OverflowError, OSError):
-        return math.nan
+    if is_real(text):
+        return float(text)
+    text = text.replace("Z", "+00:00")
+    for dated in (text, f"2000-01-01T{text}"):
+        try:
+            return datetime.fromisoformat(dated).timestamp()
+        except (ValueError, OverflowError, OSError):
+            continue
+    return math.nan
 
 
 def _image_file(row: CsvRow, folder: Path, column: str) -> Path:

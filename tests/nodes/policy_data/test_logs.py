@@ -495,6 +495,7 @@ DAYS = [f"2026-11-30T10:00:0{k}Z" for k in range(8)]
         ("Timestamp [ms]", [3, 2, 1, 0], 3),
         ("header.stamp_ns", [1, 2, 3, 1e-3], 5),
         ("stamp", [*DAYS[4:], *DAYS[:4]], 6),
+        ("time", ["10:00:03.250", "10:00:03.350", "10:00:01.000", "10:00:02"], 4),
         ("exposure_time", [3, 2, 1, 0], None),
         ("timeout", [3, 2, 1, 0], None),
         ("timestamp", ["b", "a", "c", "a"], None),
