@@ -10,6 +10,7 @@ import typer
 
 from nodes.cli.replay import replay
 from nodes.cli.trial import evaluate
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import FAILURE_EXIT, RunDir, Topics, fail_unless, print_table, say_error, table
 
 if TYPE_CHECKING:
@@ -123,6 +124,7 @@ def bag_extract(
 
 
 @app.command("record")
+@with_groups
 def bag_record(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="New folder for the bag.", show_default="bag-<time>")
@@ -173,6 +175,7 @@ def bag_record(
 
 
 @app.command("play")
+@with_groups
 def bag_play(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     rate: Annotated[

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import Overrides, fail_unless, print_findings
 
 app = typer.Typer(
@@ -24,6 +25,7 @@ def camera_list() -> None:
 
 
 @app.command("try")
+@with_groups
 def camera_try(
     source: Annotated[
         str,

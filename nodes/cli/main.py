@@ -41,6 +41,7 @@ from nodes.cli.endings import (
 )
 from nodes.cli.panels import in_panels
 from nodes.runtime.extras import installs
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import FAILURE_EXIT, LaunchFile, Overrides, print_table, say_error, table
 from nodes.runtime.termination import ends_in_order
 
@@ -107,6 +108,7 @@ def options(
 
 
 @app.command()
+@with_groups
 def launch(
     file: LaunchFile,
     overrides: Overrides = None,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import FAILURE_EXIT, RunDir, fail_unless, print_table, table
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ def info(port: Port = "/dev/vesc") -> None:
 
 
 @app.command("set-timeout")
+@with_groups
 def set_timeout(
     timeout_ms: Annotated[
         int,

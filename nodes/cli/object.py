@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import print_table, table
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ _OPTIONS_OF = {
 
 
 @app.command("build")
+@with_groups
 def object_build(
     file: Annotated[
         Path | None, typer.Argument(help="Mesh file: GLB, OBJ, PLY or STL.", exists=True, dir_okay=False)

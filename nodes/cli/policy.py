@@ -12,6 +12,7 @@ from advnerf_core.unit_bounds import MOST_SPEED_MPS
 from nodes.cli import policy_train as cli_policy_train
 from nodes.cli.policy_train import Goal
 from nodes.runtime.findings import CheckFinding
+from nodes.runtime.options import with_groups
 from nodes.runtime.paths import shipped
 from nodes.runtime.terminal import FAILURE_EXIT, PolicyName, fail_unless, print_findings, print_table, table
 from nodes.runtime.termination import ends_in_order
@@ -141,6 +142,7 @@ def _reference(
 
 
 @app.command("serve")
+@with_groups
 def policy_serve(
     policy: PolicyName,
     listen: Annotated[

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import FAILURE_EXIT, RunDir, numbers_of, print_table, say_error, table
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ _ORIGIN = "0,0,0"
 
 
 @app.command("path")
+@with_groups
 def room_path(
     bag: BagFile,
     output: Output = Path("room.yaml"),
@@ -81,6 +83,7 @@ def room_path(
 
 
 @app.command("fence")
+@with_groups
 def room_fence(
     bag: BagFile,
     output: Output = Path("room.yaml"),
@@ -119,6 +122,7 @@ def room_fence(
 
 
 @app.command("target")
+@with_groups
 def room_target(
     output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")],
     subject: Annotated[str, typer.Option(help="Motion-capture subject: board or monitor.")],
@@ -181,6 +185,7 @@ def room_target(
 
 
 @app.command("place")
+@with_groups
 def room_place(
     attack_file: Annotated[Path, typer.Argument(help="Attack file.", exists=True, dir_okay=False)],
     target_file: Annotated[

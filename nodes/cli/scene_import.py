@@ -86,6 +86,7 @@ def from_images(
 
 
 @app.command("from-bag")
+@with_groups
 def from_bag(
     bag: Bag,
     output: Output,
@@ -106,6 +107,7 @@ def from_bag(
 
 
 @app.command("from-phone-and-car")
+@with_groups
 def from_phone_and_car(
     media: Media,
     output: Output,

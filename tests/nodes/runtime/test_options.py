@@ -1,10 +1,14 @@
 """Options: what commands refuse in them."""
 
+from pathlib import Path
+
 import pytest
 
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.terminal import listen_address
 from tests.support.commands import advnerf
+
+CORNER = Path(__file__).parents[2] / "replay" / "corner.mcap"
 
 
 @pytest.mark.parametrize(
@@ -20,6 +24,25 @@ def test_infinite_numbers_are_refused_with_the_option(tmp_path, monkeypatch, cap
     given = [word.format(folder=tmp_path) for word in words]
     assert advnerf(monkeypatch, "scene", *given) == 2
     assert f"expected finite numbers for {option}, got" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        ("bag play {bag} --folder {folder}/run --offset inf", "--offset"),
+        ("bag play {bag} --folder {folder}/run --duration inf", "--duration"),
+        ("scene room path {bag} -o {folder}/room.yaml --off-track inf", "--off-track"),
+        ("scene room fence {bag} -o {folder}/room.yaml --margin inf", "--margin"),
+    ],
+)
+def test_infinite_numbers_about_bags_are_refused_with_the_option(
+    tmp_path, monkeypatch, capsys, words, option
+):
+    """A player ended in a traceback."""
+    given = words.format(folder=tmp_path, bag=CORNER).split()
+    assert advnerf(monkeypatch, *given) == 2
+    assert f"expected finite numbers for {option}, got inf" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
