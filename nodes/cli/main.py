@@ -230,6 +230,9 @@ def _exit_code() -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except SystemExit as asked:
+        # rich and click end so where `head` has read enough
+        if isinstance(asked.__context__, BrokenPipeError):
+            return FAILURE_EXIT
         return _code_of_exit(asked.code)
     except typer.Abort:
         say_error("aborted")

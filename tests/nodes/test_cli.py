@@ -424,6 +424,19 @@ def test_a_users_code_that_exits_inside_a_command_is_an_error(command, monkeypat
     assert f"code of yours to return, it has called sys.exit({code or ''})" in errors
 
 
+def test_a_reader_that_has_read_enough_is_no_error(command, monkeypatch):
+    """As of ``advnerf launch --help | head -1``."""
+
+    def broken(*_):
+        try:
+            raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+        except BrokenPipeError:
+            sys.exit(1)  # as rich does
+
+    monkeypatch.setattr("nodes.lab.method_check.check_method", broken)
+    assert command("attack", "method", "check", "random") == (1, "", "")
+
+
 def test_play_refuses_what_is_not_there(command, tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/vicon/car", encode(pose_message(np.eye(4), 1)), 1, 1, 0)
