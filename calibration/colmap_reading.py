@@ -83,14 +83,19 @@ def _read(folder: Path) -> Any:
 
 
 def _require_names(model: Any, folder: Path) -> None:
-    """Names are bytes in COLMAP's files, and pycolmap decodes them when they are asked for."""
+    """Names are bytes in COLMAP's files, and pycolmap decodes them when they are asked for; of a text file's it reads the part before a space."""
     try:
-        for each in model.images.values():
-            _ = each.name
+        counts = Counter(each.name for each in model.images.values())
     except UnicodeDecodeError as error:
         raise ReconstructionError(
             f"expected names of images in UTF-8 in {folder}, got {error.object!r}; copy its files again, or rename the images and run COLMAP again"
         ) from None
+    for name, count in counts.most_common(1):
+        if count > 1:
+            raise ReconstructionError(
+                f"expected each image of {folder} once, got {count} of the name {name!r}; names with spaces are cut in text files: give the binary "
+                "model, or rename the images and run COLMAP again"
+            )
 
 
 def _converted(found: Any, folder: Path, sizes: dict[str, int], parts: int) -> ColmapModel:

@@ -127,6 +127,19 @@ def test_a_name_of_another_encoding_is_one_line(tmp_path, text, file):
         read_colmap(tmp_path)
 
 
+@pytest.mark.parametrize(("text", "form"), [(False, "photo.png"), (True, "photo {}.png")])
+def test_images_of_one_name_are_refused(tmp_path, text, form):
+    """One file was taken for five images; of a name with spaces in a text file, pycolmap reads the first word."""
+    model = synthetic()
+    for number, image in model.images.items():
+        image.name = form.format(number)
+    with pytest.raises(
+        ReconstructionError,
+        match=r"^expected each image of .* once, got 5 of the name 'photo.*; names with sp",
+    ):
+        read_colmap(write(model, tmp_path, text))
+
+
 def test_poses_that_are_not_numbers_are_refused(tmp_path):
     file = write(synthetic(), tmp_path, rigs=False) / "images.bin"
     data = bytearray(file.read_bytes())
