@@ -52,6 +52,7 @@ _OTHER_KEYS = (
 )  # fmt: skip
 # In the order in which they count where a file has several.
 _FOCAL_FORMS = (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y"), ("x_fov", "y_fov"))
+_IN_PIXELS = ("fl_x", "fl_y", "cx", "cy")
 _SPLITS = (TRAIN, *HELD_OUT_SPLITS)
 _Values = dict[str, Any]
 
@@ -105,7 +106,9 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
                 raise ValueError(
                     f"file_path: expected each image once, got that of frame {first} again; remove one of the two"
                 )
-            values = {**_without_other_focal_lengths(content, entry), **entry}
+            common = _without_other_focal_lengths(content, entry)
+            _require_pixels_of_one_size(common, entry)
+            values = {**common, **entry}
             frames.append(_frame(path.parent, image, values, split or split_of.get(_normal(name))))
         except ValueError as error:
             label = f" ({entry['file_path']})" if isinstance(entry, dict) and "file_path" in entry else ""
@@ -305,6 +308,18 @@ def _without_other_focal_lengths(content: _Values, entry: _Values) -> _Values:
             )
     others = {key for keys in _FOCAL_FORMS if keys != form for key in keys}
     return {key: value for key, value in content.items() if key not in others}
+
+
+def _require_pixels_of_one_size(content: _Values, entry: _Values) -> None:
+    """Raise for numbers of pixels from the file in a frame of another size, where they mean another camera."""
+    for side in ("w", "h"):
+        own, common = entry.get(side), content.get(side)
+        taken = [key for key in _IN_PIXELS if entry.get(key) is None and content.get(key) is not None]
+        if taken and own is not None and common is not None and own != common:
+            raise ValueError(
+                f"{side}: expected the size of the file, {common!r:.40}, as {', '.join(taken)} of the file are in its pixels, got {own!r:.40}; "
+                f"give the frame its own {', '.join(taken)} too"
+            )
 
 
 def _pinhole(image: Path, values: _Values) -> Pinhole:

@@ -134,6 +134,21 @@ def test_a_focal_length_of_a_frame_is_not_joined_with_the_files_for_the_other_ax
         load_transforms(file)
 
 
+def test_pixels_of_the_file_are_not_taken_for_those_of_a_frame_of_another_size(tmp_path):
+    size = {"w": WIDTH * 2, "h": HEIGHT * 2}
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in range(2)]
+    frames[1] |= {**size, "fl_x": 60.0, "fl_y": 60.0}
+    file = write(tmp_path, frames, w=WIDTH, h=HEIGHT, cx=WIDTH / 2, cy=HEIGHT / 2)
+    with pytest.raises(
+        DatasetError,
+        match=rf"frame 1 .*: w: expected the size of the file, {WIDTH}, as cx, cy .* its own cx, cy",
+    ):
+        load_transforms(file)
+    frames[1] |= {"cx": WIDTH + 1.0, "cy": HEIGHT - 1.0}
+    write(tmp_path, frames, w=WIDTH, h=HEIGHT, cx=WIDTH / 2, cy=HEIGHT / 2)
+    assert load_transforms(file).frames[1].pinhole.cx == WIDTH + 1.0
+
+
 def test_cameras_of_one_set_keep_their_own_intrinsics_and_names(tmp_path):
     for name in ("phone.png", "car.png"):
         paint(tmp_path / name)
