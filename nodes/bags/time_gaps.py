@@ -15,8 +15,8 @@ from nodes.runtime.errors import BagError
 
 # A running stack sends statuses every second. No recording is silent for an hour.
 LONGEST_SILENCE_S = 3600.0
-# A recorder writes the messages of a topic as it receives them.
-_MOST_BACK_S = 1.0
+# A recorder writes the messages of a topic as it receives them, a second or so in a chunk: such chunks need not be read.
+_MOST_BACK_S = 2.0
 SET_BACK = "the recorder's clock was set back, and messages are read in the order of log time, not of the drive; record the drive again"
 _UNITS = (("year", 365.25 * 86400.0), ("day", 86400.0), ("hour", 3600.0))
 

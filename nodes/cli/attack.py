@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import Device, Overrides, fail_unless, print_table, table
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True,
     help="Search for textures and poses, look at and examine attacks.",
 )

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import pose_of, print_table, table
 
 if TYPE_CHECKING:
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from nodes.lab.wizards.prints import MeasuredPrint
 
 
-@with_groups
 def attack_print(
     file: Annotated[Path, typer.Argument(help="An attack file.", exists=True, dir_okay=False)],
     output: Annotated[
@@ -75,7 +73,6 @@ def attack_print(
         print(f"written: {beside[1]}, the sizes for 'advnerf attack measure'")
 
 
-@with_groups
 def attack_measure(
     source: Annotated[
         Path,

@@ -17,7 +17,6 @@ from advnerf_core.unit_bounds import MOST_LENGTH_M, MOST_SPEED_MPS
 from nodes.cli.endings import INTERRUPTED, text_for_people
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import Overrides, say_error
 
 if TYPE_CHECKING:
@@ -260,7 +259,6 @@ def _say(text: str) -> None:
     print(text, flush=True)
 
 
-@with_groups
 def audit(
     policy: Annotated[
         str,

@@ -10,7 +10,7 @@ import typer
 
 from nodes.cli.replay import replay
 from nodes.cli.trial import evaluate
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import FAILURE_EXIT, RunDir, Topics, fail_unless, print_table, say_error, table
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _DAMAGED_EXIT = 2  # as for every bag that cannot be read
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True,
     help="Record, inspect, play, replay, evaluate and repair bags (MCAP, as rosbag2 writes them).",
 )
@@ -124,7 +124,6 @@ def bag_extract(
 
 
 @app.command("record")
-@with_groups
 def bag_record(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="New folder for the bag.", show_default="bag-<time>")
@@ -175,7 +174,6 @@ def bag_record(
 
 
 @app.command("play")
-@with_groups
 def bag_play(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     rate: Annotated[

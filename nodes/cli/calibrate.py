@@ -15,14 +15,14 @@ from nodes.cli import calibrate_printer as cli_calibrate_printer
 from nodes.cli.calibrate_display import Output
 from nodes.cli.calibrate_printer import Lens
 from nodes.lab.wizards.output import keep_inputs, save_and_print
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import RunDir
 
 if TYPE_CHECKING:
     from advnerf_core.geometry import Array
     from calibration.charuco import Board
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True,
     help="Calibrate camera, car, room, monitor, printer and clocks. Poor data are rejected with the reason.",
 )
@@ -80,7 +80,6 @@ class LiveOptions:
 
 
 @app.command("board")
-@with_groups
 def board(
     output: Annotated[Path, typer.Option("--output", "-o", help="PNG file to print.")],
     options: BoardOptions,
@@ -99,7 +98,6 @@ def board(
 
 
 @app.command("intrinsics")
-@with_groups
 def intrinsics(
     output: Output,
     options: BoardOptions,
@@ -140,7 +138,6 @@ def intrinsics(
 
 
 @app.command("camera-to-car")
-@with_groups
 def camera_to_car(
     output: Output,
     lens: Lens,
@@ -185,7 +182,6 @@ def camera_to_car(
 
 
 @app.command("vehicle")
-@with_groups
 def vehicle(
     output: Output,
     before: Annotated[
@@ -228,7 +224,6 @@ def vehicle(
 
 
 @app.command("time-offset")
-@with_groups
 def time_offset(
     output: Output,
     camera: Annotated[Path, typer.Option(exists=True, help="Camera file.")],

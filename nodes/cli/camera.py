@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 
 import typer
 
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import Overrides, fail_unless, print_findings
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True, help="Find cameras, test them, and import the factory calibration of a ZED."
 )
 
@@ -25,7 +25,6 @@ def camera_list() -> None:
 
 
 @app.command("try")
-@with_groups
 def camera_try(
     source: Annotated[
         str,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import typer
-
 from nodes.cli import arm, calibrate, camera, keys, motor, node, page, teleop, topic, trial
 from nodes.cli.panels import in_panels
+from nodes.runtime.options import CommandGroup
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True,
     cls=in_panels(
         {

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import print_table, table
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True, help="CARLA as a deployment scene; docs/carla.md says how to start a server."
 )
 

@@ -17,7 +17,7 @@ from nodes.cli.panels import in_panels
 from nodes.cli.publish import publish
 from nodes.cli.register import register
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import Device, fail_unless, say_error
 from nodes.runtime.termination import ends_in_order
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from nodes.experiment.run.worker import Ended
     from nodes.experiment.show.context import Experiment
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True,
     cls=in_panels(
         {
@@ -220,9 +220,9 @@ def maps(
         print(picture)
 
 
-app.command("run")(with_groups(experiment))
+app.command("run")(experiment)
 for command in (status, report, predict, maps, register, publish):
-    app.command()(with_groups(command))
-app.command("table")(with_groups(table_command))
+    app.command()(command)
+app.command("table")(table_command)
 app.command("init")(init)
 app.command("list")(list_command)

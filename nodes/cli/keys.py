@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import print_table, table
 
 if TYPE_CHECKING:
     from nodes.linking.keys import KeyFolder
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True, help="Manage the keys that may watch or drive this host over the network."
 )
 

@@ -8,20 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nodes.cli.log_options import LogOptions, Logs, OneLog
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import coloured, print_table, table
 
 if TYPE_CHECKING:
     from nodes.lab.policy_data.log_facts import LogFacts
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True,
     help="Read drives of other cars and other software: Donkeycar, Udacity, CSV, LeRobot, ROS.",
 )
 
 
 @app.command("info")
-@with_groups
 def log_info(logs: Logs, log_options: LogOptions) -> None:
     """Show what logs contain, and what they allow: learning a policy, learning a scene, evaluating a policy."""
     from nodes.lab.policy_data.log_facts import read_facts
@@ -33,7 +32,6 @@ def log_info(logs: Logs, log_options: LogOptions) -> None:
 
 
 @app.command("export")
-@with_groups
 def log_export(
     log: OneLog,
     output: Annotated[Path, typer.Option("--output", "-o", help="New folder of the data set.")],

@@ -41,7 +41,7 @@ from nodes.cli.endings import (
 )
 from nodes.cli.panels import in_panels
 from nodes.runtime.extras import installs
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import FAILURE_EXIT, LaunchFile, Overrides, print_table, say_error, table
 from nodes.runtime.termination import ends_in_order
 
@@ -59,7 +59,7 @@ PANELS = {
     "Bags and tools": ("bag", "doctor"),
 }
 
-app = typer.Typer(
+app = CommandGroup(
     name="advnerf",
     no_args_is_help=True,
     cls=in_panels(PANELS),
@@ -108,7 +108,6 @@ def options(
 
 
 @app.command()
-@with_groups
 def launch(
     file: LaunchFile,
     overrides: Overrides = None,

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import Overrides, fail_unless, print_findings
 
-app = typer.Typer(no_args_is_help=True, help="Methods of attack: whether one keeps the contract.")
+app = CommandGroup(no_args_is_help=True, help="Methods of attack: whether one keeps the contract.")
 
 
 @app.callback()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import FAILURE_EXIT, RunDir, fail_unless, print_table, table
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from nodes.runtime.clock import Now
     from nodes.runtime.requests import RequestIdentity
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True, help="Inspect the motor controller, set its timeout, check the steering."
 )
 Port = Annotated[
@@ -56,7 +56,6 @@ def info(port: Port = "/dev/vesc") -> None:
 
 
 @app.command("set-timeout")
-@with_groups
 def set_timeout(
     timeout_ms: Annotated[
         int,

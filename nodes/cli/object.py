@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import print_table, table
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from advnerf_core.objects.voxel.model import ObjectModel
     from nodes.runtime.progress import Report
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True, help="Build objects from meshes, photographs or generators, and inspect them."
 )
 
@@ -34,7 +34,6 @@ _OPTIONS_OF = {
 
 
 @app.command("build")
-@with_groups
 def object_build(
     file: Annotated[
         Path | None, typer.Argument(help="Mesh file: GLB, OBJ, PLY or STL.", exists=True, dir_okay=False)

@@ -12,7 +12,7 @@ from advnerf_core.unit_bounds import MOST_SPEED_MPS
 from nodes.cli import policy_train as cli_policy_train
 from nodes.cli.policy_train import Goal
 from nodes.runtime.findings import CheckFinding
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.paths import shipped
 from nodes.runtime.terminal import FAILURE_EXIT, PolicyName, fail_unless, print_findings, print_table, table
 from nodes.runtime.termination import ends_in_order
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 ServiceMode = Literal["carla", "alpasim"]
 _TWIN_ROOM = shipped("calibration/twin/room.yaml")
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True,
     help="Train a policy from recordings; evaluate, check, export and inspect any policy.",
 )
@@ -142,7 +142,6 @@ def _reference(
 
 
 @app.command("serve")
-@with_groups
 def policy_serve(
     policy: PolicyName,
     listen: Annotated[

@@ -10,7 +10,6 @@ import typer
 
 from advnerf_core.unit_bounds import MOST_LAG_S, MOST_SPEED_MPS
 from nodes.cli.log_options import LogOptions, Logs
-from nodes.runtime.options import with_groups
 from nodes.runtime.terminal import PolicyName, experiment_argument, print_table, table
 
 if TYPE_CHECKING:
@@ -88,7 +87,6 @@ class ExpertOptions:
         return Expert(DrivingPath.rounded_square(4.0, 1.1), config)
 
 
-@with_groups
 def train(
     logs: Logs,
     output: Annotated[
@@ -183,7 +181,6 @@ def train(
     )
 
 
-@with_groups
 def evaluate(
     policy: PolicyName,
     logs: Logs,

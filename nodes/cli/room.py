@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import FAILURE_EXIT, RunDir, numbers_of, print_table, say_error, table
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from calibration.path_fit import PathFit
     from calibration.schema import RoomCalibration
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True, help="Measure path, fence and targets with motion capture; place board and monitor."
 )
 
@@ -29,7 +29,6 @@ _ORIGIN = "0,0,0"
 
 
 @app.command("path")
-@with_groups
 def room_path(
     bag: BagFile,
     output: Output = Path("room.yaml"),
@@ -83,7 +82,6 @@ def room_path(
 
 
 @app.command("fence")
-@with_groups
 def room_fence(
     bag: BagFile,
     output: Output = Path("room.yaml"),
@@ -122,7 +120,6 @@ def room_fence(
 
 
 @app.command("target")
-@with_groups
 def room_target(
     output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")],
     subject: Annotated[str, typer.Option(help="Motion-capture subject: board or monitor.")],
@@ -185,7 +182,6 @@ def room_target(
 
 
 @app.command("place")
-@with_groups
 def room_place(
     attack_file: Annotated[Path, typer.Argument(help="Attack file.", exists=True, dir_okay=False)],
     target_file: Annotated[

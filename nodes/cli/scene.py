@@ -15,10 +15,10 @@ from nodes.cli import scene_import as cli_scene_import
 from nodes.cli import world as cli_world
 from nodes.cli.panels import in_panels
 from nodes.lab.training_request import TrainingRequest
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import listen_address, print_table, scene_argument, table
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True,
     cls=in_panels(
         {
@@ -62,7 +62,6 @@ _HELD_OUT_EVERY = 8
 
 
 @app.command("train")
-@with_groups
 def scene_train(request: TrainingRequest) -> None:
     """Train a scene on posed images and print PSNR and SSIM on the held-out images.
 

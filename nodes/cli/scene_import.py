@@ -11,13 +11,13 @@ import typer
 
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.lab.importing.splat_options import SplatOptions
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import print_table, scene_argument, table
 
 if TYPE_CHECKING:
     from nodes.lab.importing.data_set import Facts
 
-app = typer.Typer()
+app = CommandGroup()
 
 Output = Annotated[
     Path,
@@ -63,7 +63,6 @@ _SHOWN = 50
 
 
 @app.command("from-images")
-@with_groups
 def from_images(
     media: Media,
     output: Output,
@@ -86,7 +85,6 @@ def from_images(
 
 
 @app.command("from-bag")
-@with_groups
 def from_bag(
     bag: Bag,
     output: Output,
@@ -107,7 +105,6 @@ def from_bag(
 
 
 @app.command("from-phone-and-car")
-@with_groups
 def from_phone_and_car(
     media: Media,
     output: Output,
@@ -152,7 +149,6 @@ def from_phone_and_car(
 
 
 @app.command("from-scan")
-@with_groups
 def from_scan(
     scan: Annotated[
         Path,
@@ -199,7 +195,6 @@ def from_scan(
 
 
 @app.command("from-splat")
-@with_groups
 def from_splat(
     splat: Annotated[
         Path,

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from nodes.runtime.options import with_groups
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import RunDir, print_table, table
 
 TopicName = Annotated[str, typer.Argument(help="Name of the topic, such as /vicon/car.")]
 
-app = typer.Typer(no_args_is_help=True, help="Inspect the topics of a running launch.")
+app = CommandGroup(no_args_is_help=True, help="Inspect the topics of a running launch.")
 
 
 @app.command("list")
@@ -35,7 +35,6 @@ def topic_list(run_dir: RunDir = None) -> None:
 
 
 @app.command("hz")
-@with_groups
 def topic_hz(
     topic: TopicName,
     duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Time to listen [s].")] = 5.0,
@@ -56,7 +55,6 @@ def topic_hz(
 
 
 @app.command("echo")
-@with_groups
 def topic_echo(
     topic: TopicName,
     count: Annotated[int | None, typer.Option(min=1, help="Stop after this many messages.")] = None,

@@ -7,10 +7,11 @@ from typing import Annotated
 
 import typer
 
+from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import FAILURE_EXIT, Overrides, fail_unless, print_findings
 from nodes.runtime.termination import ends_in_order
 
-app = typer.Typer(
+app = CommandGroup(
     no_args_is_help=True,
     help="Places that are driven: installing those of other people, and whether one keeps the contract.",
 )

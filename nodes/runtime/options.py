@@ -9,10 +9,29 @@ from collections.abc import Callable
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, get_type_hints
 
+import typer
+from typer.models import CommandFunctionType
+
 from nodes.runtime.errors import ConfigError
 
 
-def with_groups(command: Callable[..., None]) -> Callable[..., None]:
+class CommandGroup(typer.Typer):
+    """A group of commands that take dataclasses as parameters and refuse infinite numbers; see `_with_groups`."""
+
+    def command(
+        self, name: str | None = None, **settings: Any
+    ) -> Callable[[CommandFunctionType], CommandFunctionType]:
+        """Register a command as `typer.Typer.command` does; the function itself stays as it is."""
+        register = super().command(name, **settings)
+
+        def registered(command: CommandFunctionType) -> CommandFunctionType:
+            register(_with_groups(command))
+            return command
+
+        return registered
+
+
+def _with_groups(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command one option or argument for each field of its dataclass parameters.
 
     A field is declared as a parameter is: ``steps: Annotated[int, typer.Option(...)] = 800``. A group of fields is replaced in the place
@@ -31,12 +50,12 @@ def with_groups(command: Callable[..., None]) -> Callable[..., None]:
     declared = {parameter.name: parameter for parameter in parameters}
 
     @functools.wraps(command)
-    def run(**given: Any) -> None:
+    def run(**given: Any) -> Any:
         for name, value in given.items():
             _require_finite(declared[name], value)
         for name, group in groups.items():
             given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
-        command(**given)
+        return command(**given)
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import signal
@@ -99,7 +100,7 @@ def test_options_for_folders_have_two_names_and_one_name_means_one_thing() -> No
 def test_a_name_stands_for_one_command_except_the_stop() -> None:
     callbacks: dict[Any, list[str]] = {}
     for name, command in commands():
-        callbacks.setdefault(command.callback.__wrapped__, []).append(name)
+        callbacks.setdefault(inspect.unwrap(command.callback), []).append(name)
     assert [names for names in callbacks.values() if len(names) > 1] == [["disarm", "car disarm"]]
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from advnerf_core.csv_rows import read_csv
 from advnerf_core.files import natural_order
@@ -123,8 +124,7 @@ def _one_lap(points: Array, near_m: float) -> Array:
     if not again.size:
         return points
     lap, later = np.split(points, again[:1])
-    is_on_lap = np.linalg.norm(later[:, None] - lap[None], axis=2).min(axis=1) <= near_m
-    return lap if is_on_lap.all() else points
+    return lap if (cKDTree(lap).query(later)[0] <= near_m).all() else points
 
 
 def _averaged(points: Array, spacing_m: float, closed: bool) -> Array:
