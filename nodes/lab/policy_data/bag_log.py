@@ -50,6 +50,7 @@ _ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 _LIKE_STEERING = re.compile("ackermann|twist|float|steer|drive|control|cmd", re.IGNORECASE)
 _JOIN_S = 0.12
 _MOST_BACK_S = 1.0  # messages of one topic may overtake each other, but no clock of a drive goes back
+_MOST_APART_S = 0.5  # delays until the recording differ by less
 _TIMED = 200  # images from which the rate is determined
 _STAMPS = 8  # messages that show whether a topic is stamped
 _Time = Callable[[BagMessage, Any], int]
@@ -116,7 +117,14 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
     kinds = {images: IMAGE_TYPE, **({steering: _steering_type(steering)} if steering else {})}
     others = [name for name in cameras if name != images]
     with _naming(others):
-        unstamped = _unstamped(bag, kinds)
+        first_ns = _first_times(bag, kinds)
+    unstamped = [
+        topic
+        for topic, times in first_ns.items()
+        if len(times) > 1 and len({stamp for _, stamp in times}) == 1
+    ]
+    if not unstamped:
+        _require_one_clock(bag, first_ns)
     time_ns = _recorded_ns if unstamped else _stamped_ns
     spans = cache(partial(_spans, info, [*joined, *([steering] if steering else [])] or [images]))
     track = cache(lambda: _read_track(bag, steering, joined, time_ns, spans()))
@@ -186,19 +194,36 @@ def _steering_type(topic: str) -> str:
     return topic_row(topic).type if topic == _SENT else _ACKERMANN
 
 
-def _unstamped(bag: Path, kinds: Mapping[str, str]) -> list[str]:
-    """Topics whose first messages all have one stamp, as of a node that leaves it at zero: such a stamp joins nothing.
+def _first_times(bag: Path, kinds: Mapping[str, str]) -> dict[str, list[tuple[int, int]]]:
+    """Times of recording and stamps [ns] of the first messages of topics. If all stamps are equal, as of a node that leaves them at zero, they join nothing.
 
     Args:
         kinds: Types by topic.
     """
-    found = []
+    found = {}
     for topic, kind in kinds.items():
         messages = islice(read_messages(bag, [topic], types={topic: kind}), _STAMPS)
-        stamps = [_stamped_ns(message, decode(kind, message.cdr)) for message in messages]
-        if len(stamps) > 1 and len(set(stamps)) == 1:
-            found.append(topic)
+        found[topic] = [(each.log_ns, _stamped_ns(each, decode(kind, each.cdr))) for each in messages]
     return found
+
+
+def _require_one_clock(bag: Path, first_ns: Mapping[str, Sequence[tuple[int, int]]]) -> None:
+    """Refuse stamps that no message can have when it is recorded, unless all have them: images would get the steering of other times.
+
+    Args:
+        first_ns: Times of recording and stamps by topic.
+    """
+    ahead_s = {
+        topic: min(stamp - log for log, stamp in times) / NS_PER_S
+        for topic, times in first_ns.items()
+        if times
+    }
+    first, last = min(ahead_s, key=ahead_s.__getitem__), max(ahead_s, key=ahead_s.__getitem__)
+    if ahead_s[last] > _JOIN_S and ahead_s[last] - ahead_s[first] > _MOST_APART_S:
+        raise LogError(
+            f"{bag}: expected stamps of one clock, got those of {last} {ahead_s[last]:.3g} s after their recording, and those of {first} "
+            f"{-ahead_s[first]:.3g} s before it; set the clocks of all computers (chrony) and record again"
+        )
 
 
 def _stamped_ns(message: BagMessage, decoded: Any) -> int:

@@ -126,6 +126,7 @@ def write_ackermann(
     log_back_ns=0,
     repeated=(),
     kind=ACKERMANN,
+    ahead_s=0,
 ):
     """A bag of other software: images, and commands of a car.
 
@@ -137,6 +138,7 @@ def write_ackermann(
         depths: Topics with images of depths.
         log_back_ns: By how much the recorder's clock is set back before the fourth image [ns].
         kind: Type of the commands.
+        ahead_s: By how much the clock of the commands is ahead [s].
         repeated: Images with the stamp of the one before.
     """
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
@@ -176,6 +178,7 @@ def write_ackermann(
                     continue
                 message = store.types[ACKERMANN](header=make.header(k, "car"), drive=command)
                 message.header.stamp.sec += late_ns // 10**9 - (2 if k >= 3 and topic in going_back else 0)
+                message.header.stamp.sec += ahead_s
                 if topic in unstamped:
                     message.header.stamp.sec = message.header.stamp.nanosec = 0
                 writer.write(drive, t + late_ns, pack(message, ACKERMANN))
@@ -267,6 +270,13 @@ def test_a_log_that_training_refuses_is_not_promised(tmp_path, change, told):
     assert (learned.why, evaluated.why) == (told, told)
     facts = read_facts(open_log(write_ackermann(tmp_path / "right", "ros2", count=20)))
     assert [each.possible for each in facts.verdicts()][::2] == [True, True]
+
+
+def test_commands_of_another_clock_are_refused(tmp_path):
+    """Most images got the steering of two seconds later."""
+    said = r"expected stamps of one clock, got those of /drive 2 s after their recording, and those of /front/image .*; set the"
+    with pytest.raises(LogError, match=said):
+        open_log(write_ackermann(tmp_path / "drive", "ros2", count=60, ahead_s=2))
 
 
 def test_a_drive_whose_clocks_differ_is_answered_with_the_times(tmp_path):
