@@ -82,12 +82,13 @@ def read_upright(path: Path) -> tuple[Rgb, Grey | None]:
 
 
 def read_mask(path: Path) -> Grey:
-    """A mask ``[H, W]`` of stored pixels; pixels that are not black are kept."""
+    """A mask ``[H, W]`` of stored pixels; pixels that are neither black nor fully transparent are kept."""
     try:
-        rgb, _ = read_stored(path)
+        rgb, alpha = read_stored(path)
     except DatasetError as error:
         raise DatasetError(f"mask: {error}") from error
-    return np.asarray(rgb.max(axis=-1), np.uint8)
+    grey = np.asarray(rgb.max(axis=-1), np.uint8)
+    return grey if alpha is None else np.minimum(grey, alpha)
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -100,6 +100,16 @@ def photograph(**options):
     return buffer.getvalue()
 
 
+def test_what_is_transparent_in_a_mask_is_not_kept(tmp_path):
+    """As of tools that cut a picture out: they kept all of it."""
+    pixels = np.full((4, 6, 4), 200, np.uint8)
+    pixels[:, 2:, 3] = pixels[0, :2, :3] = 0
+    assert cv2.imwrite(str(tmp_path / "mask.png"), pixels)
+    assert np.argwhere(read_mask(tmp_path / "mask.png")).tolist() == [
+        [y, x] for y in (1, 2, 3) for x in (0, 1)
+    ]
+
+
 @pytest.mark.parametrize("options", [{}, {"optimize": True}, {"progressive": True}, {"subsampling": 0}])
 @pytest.mark.parametrize("hole", ["zeros", "noise", "missing"])
 def test_a_jpeg_with_a_hole_is_damaged(tmp_path, options, hole):
