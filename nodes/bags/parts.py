@@ -63,6 +63,17 @@ def bag_parts(bag: Path) -> tuple[Path, ...]:
     return _by_number(bag, files)
 
 
+def unread_files(bag: Path) -> tuple[str, ...]:
+    """Names of the bag files in a bag's folder that are not its parts, as of another recording that was copied there."""
+    if not Path(bag).is_dir():
+        return ()
+    parts = bag_parts(bag)
+    files = [
+        file for suffix in SUFFIXES for file in sorted(Path(bag).glob(f"[!.]*{suffix}")) if file.is_file()
+    ]
+    return tuple(file.name for file in files if file not in parts)
+
+
 def _parts_with(file: Path) -> tuple[Path, ...]:
     """All parts of the bag to which a file belongs."""
     if listed := listed_files(file.parent):

@@ -41,7 +41,7 @@ def bag_info(
     from datetime import datetime
 
     from nodes.bags.check import diagnose
-    from nodes.bags.parts import bag_parts
+    from nodes.bags.parts import bag_parts, unread_files
     from nodes.bags.reader import read_info
     from nodes.bags.time_gaps import SET_BACK, read_gaps, read_steps_back, silence_s
 
@@ -63,6 +63,8 @@ def bag_info(
         print(f"{gap}: the recorder's clock was set; replay, play and evaluate skip this time")
     for step in read_steps_back(bag):
         print(f"{step}: {SET_BACK}")
+    if unread := unread_files(bag):
+        print(f"not read, as no part of this bag: {', '.join(unread)}; give each of these files by itself")
     for key, value in info.metadata.items():
         print(f"{key}: {value}")
     print(f"attachments: {', '.join(info.attachments) or 'none'}")

@@ -1,5 +1,7 @@
 """Bags that others split: read as one, in the order of time, whatever part a message or an attachment is in."""
 
+import shutil
+
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -8,6 +10,7 @@ from nodes.bags import reader
 from nodes.bags.reader import extract_attachments, read_attachment, read_attachments, read_info, read_messages
 from nodes.runtime.errors import BagError
 from tests.support.bag_samples import START_NS
+from tests.support.commands import advnerf
 from tests.support.split_samples import foreign_metadata, foreign_part
 
 TOPICS = ("/vicon/car", "/arm", "/policy/drive")
@@ -66,6 +69,15 @@ def test_info_is_about_all_parts_and_attachments_come_from_any(tmp_path):
     assert [path.read_bytes() for path in extract_attachments(folder, tmp_path / "out")] == [b"0", b"2"]
     with pytest.raises(BagError, match=r"it has 0\.yaml, 2\.yaml"):
         read_attachment(folder, "1.yaml")
+
+
+def test_another_recording_in_the_folder_is_named(tmp_path, monkeypatch, capsys):
+    folder, *_ = split_bag(tmp_path)
+    for name in ("other.mcap", "theirs.db3"):
+        shutil.copy(folder / "theirs_0.mcap", folder / name)
+    assert not advnerf(monkeypatch, "bag", "info", str(folder))
+    assert "not read, as no part of this bag: other.mcap, theirs.db3; give each" in capsys.readouterr().out
+    assert read_info(folder / "other.mcap").parts == (folder / "other.mcap",)
 
 
 def test_a_missing_part_is_no_shorter_recording(tmp_path):
