@@ -1,6 +1,7 @@
 """What is registered before anything is run, and which cells are run under it."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from nodes.experiment.run import plan
 from nodes.experiment.run.plan import plan_cells, registered_under
 from nodes.experiment.run.registering import primary_tests, register, registered_scenario
 from nodes.experiment.steps.keys import registered_settings
+from nodes.experiment.steps.run import load_experiment
+from nodes.runtime.errors import ConfigError
 from tests.support.stage_versions import tiny_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch"
@@ -172,6 +175,34 @@ def test_registering_again_says_when_it_was_and_does_not_ask_to_run_it(tmp_path,
     (date,) = (json.loads(each.read_text())["date"] for each in tmp_path.rglob(FILE))
     assert "2 primary tests; commit it, then run the experiment\n" in first
     assert f"2 primary tests; registered before, on {date}\n" in again
+
+
+def test_live_drives_are_registered_with_their_graph(tmp_path):
+    """One whose launch file was changed since then is another experiment; what drives through the world has no graph."""
+    for name in ("room.experiment.yaml", "room.reference.yaml", "green_screen.launch.yaml"):
+        shutil.copy(LAUNCH / name, tmp_path / name)
+    graph = tmp_path / "green_screen.launch.yaml"
+
+    def keys():
+        made = [
+            load_experiment(
+                tmp_path / "room.experiment.yaml", "demo", [f"deploy.through={way}"], tmp_path / "run"
+            )
+            for way in ("nodes", "world")
+        ]
+        return [registered_settings(each).key for each in made]
+
+    before = keys()
+    graph.write_text(graph.read_text() + "# said differently\n")
+    assert keys() == before
+    slower = 'vicon: {port: "${vicon_port}", latency_s: 0.08}'
+    graph.write_text(graph.read_text().replace('vicon: {port: "${vicon_port}"}', slower))
+    assert slower in graph.read_text()
+    live, world = keys()
+    assert (live != before[0], world == before[1]) == (True, True)
+    graph.unlink()
+    with pytest.raises(ConfigError, match=r"green_screen\.launch\.yaml"):
+        keys()
 
 
 def test_a_registration_after_the_fact_is_refused(experiment, tmp_path):
