@@ -6,7 +6,6 @@ import csv
 import io
 import itertools
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,7 +56,7 @@ def read_csv(
     reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     rows: list[CsvRow] = []
     problems: list[str] = []
-    lengths: Counter[int] = Counter()
+    names: list[str] = []
     began = 1
     try:
         first = next(reader, [])
@@ -68,7 +67,6 @@ def read_csv(
         began = reader.line_num + 1
         for values in itertools.chain([first] if is_bare else [], reader):
             place = f"{path}:{reader.line_num}"
-            lengths[len(values)] += 1
             if len(values) not in (0, len(names)):
                 problems.append(
                     f"{place}: expected {len(names)} fields as in the header, got {len(values)}; "
@@ -81,11 +79,10 @@ def read_csv(
         problems.append(
             f"{path}:{began}: expected valid CSV: {error}; close each quote at the end of its field, or remove it"
         )
-    del lengths[0]  # empty lines
-    if not rows and len(lengths) == 1 and lengths.total() == len(problems) > 1:
+    is_remark = len(names) == 1 or "".join(names).startswith("#")
+    if is_remark and not rows and len(problems) > 1:
         raise ConfigError(
-            f"{path}:1: expected a header of {next(iter(lengths))} fields as in every row, got {len(names)}: {', '.join(names):.80}; remove "
-            "lines before the header, and write numbers with a decimal point"
+            f"{path}:1: expected a header of as many fields as the rows have, got {', '.join(names):.80}; remove the lines before the header"
         )
     raise_problems(problems)
     return rows

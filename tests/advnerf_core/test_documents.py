@@ -201,7 +201,7 @@ def test_every_mistake_of_a_csv_file_has_its_line(tmp_path, text, message):
 
 
 def test_a_line_before_the_header_is_told_once(tmp_path):
-    said = r"^[^\n]*log\.csv:1: expected a header of 2 fields as in every row, got 1: # my drive; remove lines before the header[^\n]*$"
+    said = r"^[^\n]*log\.csv:1: expected a header of as many fields as the rows have, got # my drive; remove the lines before the header[^\n]*$"
     with pytest.raises(ConfigError, match=said):
         read_csv(written(tmp_path, "# my drive\n\na,b\n1,2\n3,4\n"))
 

@@ -65,9 +65,10 @@ def test_field_of_view_stands_in_for_missing_intrinsics(tmp_path: Path) -> None:
 def test_own_intrinsics_of_a_frame_win(tmp_path: Path) -> None:
     path = write_set(tmp_path)
     content = json.loads(path.read_text())
-    content["frames"][1]["fl_x"] = 77.0
+    content["frames"][1] |= {"fl_x": 77.0, "fl_y": 78.0}
     path.write_text(json.dumps(content))
     assert [f.pinhole.fx for f in load_transforms(path).frames] == [50.0, 77.0, 50.0]
+    assert [f.pinhole.fy for f in load_transforms(path).frames] == [51.0, 78.0, 51.0]
 
 
 def test_missing_images_are_reported_or_refused(tmp_path: Path) -> None:
