@@ -78,7 +78,7 @@ def place_of_photographs(
     if answers.speed_mps is not None:
         of_car["speed_mps"] = answers.speed_mps
     height_m = answers.camera_height_m or car.camera_height_m
-    # The cameras of photographs beside a path of points are those of a person, not the car's.
+    # Photographs that do not show a drive were taken at another height.
     if height_m is None and there.ground_at_zero and (path == DRIVEN or path.endswith(".json")):
         height_m = _height_m(there.poses if path == DRIVEN else Path(path))
     height_m = answer(height_m, "--camera-height", "Height of the driving camera above the ground [m]", float)
