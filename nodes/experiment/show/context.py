@@ -33,6 +33,7 @@ from nodes.experiment.show.given import given_in, given_victim
 from nodes.lab.policy_camera import require_camera, same_camera
 from nodes.lab.policy_data.frames import OWN_VIEW, view_for_camera
 from nodes.lab.worlds.expert_drive import as_path, expert_of
+from nodes.launching.launch_file import load_launch
 from nodes.runtime.errors import ConfigError
 
 # A driving camera whose size differs from the default view's by more than this factor needs a view of its own.
@@ -249,6 +250,15 @@ class Experiment(ExperimentWorld):
     def launch_file(self) -> FilePath:
         """The node graph of live drives."""
         return self.file.parent / self.config.deploy.launch_file
+
+    @cached_property
+    def graph(self) -> dict[str, Any]:
+        """The resolved node graph of live drives, the same on every machine, wherever it is installed.
+
+        Raises:
+            ConfigError: There is no such launch file, or it is wrong.
+        """
+        return load_launch(self.launch_file, twin_calibration="calibration/twin").resolved
 
     def cell_folder(self, cell: Cell) -> FilePath:
         """Folder in which this experiment itself runs a cell."""

@@ -20,7 +20,6 @@ from nodes.experiment.show.faces import has_face
 from nodes.experiment.show.given import given_in, given_victim, victim_sha256, victim_spec
 from nodes.experiment.show.spaces import named_objects
 from nodes.experiment.steps import bake
-from nodes.launching.launch_file import load_launch
 from nodes.runtime.errors import RuntimeFault
 
 # Like a stage's version (`pipeline.VERSIONS`): raised when the result of a cell changes with the same settings.
@@ -126,13 +125,8 @@ def _common_inputs(experiment: Experiment, deployed: bool = True) -> dict[str, A
         "world": experiment.seen_settings if seen else experiment.world_settings,
         "deployed_world": experiment.known_deployed.settings if deployed and config.deploy.world else None,
         "view": experiment.view_settings,
-        **({"graph_sha256": _graph_sha256(experiment)} if deployed and config.deploy.live else {}),
+        **({"graph_sha256": hash_of(experiment.graph)} if deployed and config.deploy.live else {}),
     }
-
-
-def _graph_sha256(experiment: Experiment) -> str:
-    """Hash of the node graph of live drives, the same on every machine, wherever it is installed."""
-    return hash_of(load_launch(experiment.launch_file, twin_calibration="calibration/twin").resolved)
 
 
 def registered_settings(experiment: Experiment) -> Settings:

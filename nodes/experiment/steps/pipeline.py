@@ -22,7 +22,6 @@ from nodes.experiment.show.faces import has_face
 from nodes.experiment.show.given import given_in, victim_sha256
 from nodes.experiment.show.learned_scene import VIEWS
 from nodes.experiment.steps import bake, capture, live, policy, retrain, scene
-from nodes.launching.launch_file import load_launch
 from nodes.runtime.progress import MeasuringReport
 
 # Raised when the output of a stage changes with the same settings, or a default that it reads does: then its old results, and all that build
@@ -193,14 +192,12 @@ def _retrain(experiment: Experiment, rounds: int) -> Stage:
 
 def _live(experiment: Experiment) -> Stage:
     config, main = experiment.config, experiment.config.main_victim
-    # The same on every machine, wherever it is installed.
-    graph = load_launch(experiment.launch_file, twin_calibration="calibration/twin").resolved
     is_given = main in given_in(config)
     settings = Settings.of(
         config,
         READS["live"],
         world=experiment.world_settings,
-        graph=graph,
+        graph=experiment.graph,
         victim=victim_sha256(experiment, main) if is_given else main,
     )
     after = ("capture",) if is_given else ("capture", config.policy_stage(main))
