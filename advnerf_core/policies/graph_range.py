@@ -11,6 +11,8 @@ import numpy as np
 _PASSED = frozenset(
     {"Cast", "Identity", "Transpose", "Reshape", "Squeeze", "Unsqueeze", "Pad", "Slice", "Crop"}
 )
+# Layers that scale, and the constant with which they change nothing and say nothing; a mean always says something.
+_NEUTRAL = {"BatchNormalization": None, "Sub": 0.0, "Add": 0.0, "Div": 1.0, "Mul": 1.0}
 # A network for images in 0..1 divides by, or compares with, nothing larger than this.
 _LARGEST_OF_ONE = 8.0
 
@@ -41,18 +43,13 @@ def _scale(node: Any, constants: dict[str, Any]) -> float | None:
     # The running mean of a batch normalisation is its fourth input.
     names = node.input[3:4] if node.op_type == "BatchNormalization" else node.input
     values = [_array(constants[name]) for name in names if name in constants]
-    if (
-        node.op_type not in ("BatchNormalization", "Sub", "Add", "Div", "Mul")
-        or not values
-        or values[0] is None
-    ):
+    if node.op_type not in _NEUTRAL or not values or values[0] is None:
         return None
     largest = float(np.abs(values[0]).max(initial=0.0))
-    normalises = node.op_type == "BatchNormalization"
-    # Images whose mean is below 0 were scaled before the network; a factor of 1 or a shift by 0 says nothing.
-    if (normalises and values[0].min(initial=0.0) < 0.0) or (
-        not normalises and largest == (0.0 if node.op_type in ("Sub", "Add") else 1.0)
-    ):
+    if largest == _NEUTRAL[node.op_type]:
+        return None
+    # Images whose mean is below 0 were scaled before the network.
+    if node.op_type == "BatchNormalization" and values[0].min(initial=0.0) < 0.0:
         return None
     if node.op_type == "Mul":
         largest = 1.0 / largest if largest > 0.0 else 0.0

@@ -68,9 +68,7 @@ def unread_files(bag: Path) -> tuple[str, ...]:
     if not Path(bag).is_dir():
         return ()
     parts = bag_parts(bag)
-    files = [
-        file for suffix in SUFFIXES for file in sorted(Path(bag).glob(f"[!.]*{suffix}")) if file.is_file()
-    ]
+    files = [file for suffix in SUFFIXES for file in _of_suffix(Path(bag), suffix)]
     return tuple(file.name for file in files if file not in parts)
 
 
@@ -92,13 +90,13 @@ def _files(folder: Path) -> list[Path]:
     """Bag files in a folder, of the first suffix that occurs."""
     if not folder.is_dir():
         return []
-    for suffix in SUFFIXES:
-        files = sorted(
-            file for file in folder.glob(f"*{suffix}") if not file.name.startswith(".") and file.is_file()
-        )
-        if files:
-            return files
-    return []
+    return next((files for suffix in SUFFIXES if (files := _of_suffix(folder, suffix))), [])
+
+
+def _of_suffix(folder: Path, suffix: str) -> list[Path]:
+    return sorted(
+        file for file in folder.glob(f"*{suffix}") if not file.name.startswith(".") and file.is_file()
+    )
 
 
 def _numbered(file: Path) -> tuple[str, int]:

@@ -67,9 +67,7 @@ def read_steps_back(bag: Path) -> tuple[str, ...]:
     limit_ns = _MOST_BACK_S * NS_PER_S
     spans = message_spans(bag)
     ends_ns = accumulate((last_ns for _, last_ns in spans), max)
-    if all(last_ns - first_ns <= limit_ns for first_ns, last_ns in spans) and all(
-        end_ns - after[0] <= limit_ns for end_ns, after in zip(ends_ns, spans[1:], strict=False)
-    ):
+    if all(end_ns - first_ns <= limit_ns for (first_ns, _), end_ns in zip(spans, ends_ns, strict=True)):
         return ()
     found: list[str] = []
     latest_ns: dict[str, int] = {}

@@ -226,9 +226,9 @@ def _through(pinhole: Pinhole, rgb: Rgb, own: Pinhole, file: Path) -> Rgb:
     """
     if pinhole == own:
         return rgb
-    own_from_wanted = own.matrix @ np.linalg.inv(pinhole.matrix)
+    directions_from_wanted = np.linalg.inv(pinhole.matrix)
     corners = np.array([[x, y, 1.0] for x in (0.5, pinhole.width - 0.5) for y in (0.5, pinhole.height - 0.5)])
-    seen = corners @ own_from_wanted.T
+    seen = corners @ (own.matrix @ directions_from_wanted).T
     size_px = np.array([own.width, own.height])
     if (seen[:, :2] < -_BEYOND * size_px).any() or (seen[:, :2] > (1.0 + _BEYOND) * size_px).any():
         raise WorldError(
@@ -241,9 +241,8 @@ def _through(pinhole: Pinhole, rgb: Rgb, own: Pinhole, file: Path) -> Rgb:
         shrunk = math.ceil(smaller * own.width), math.ceil(smaller * own.height)
         rgb = np.asarray(cv2.resize(rgb, shrunk, interpolation=cv2.INTER_AREA), np.uint8)
         own = own.resized(*shrunk)
-        own_from_wanted = own.matrix @ np.linalg.inv(pinhole.matrix)
     # OpenCV counts pixels from their centres.
-    index_map = np.linalg.inv(_HALF_PX) @ own_from_wanted @ _HALF_PX
+    index_map = np.linalg.inv(_HALF_PX) @ (own.matrix @ directions_from_wanted) @ _HALF_PX
     size = (pinhole.width, pinhole.height)
     warped = cv2.warpPerspective(
         rgb, index_map, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
