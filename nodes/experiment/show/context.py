@@ -251,9 +251,11 @@ class Experiment(ExperimentWorld):
         """The node graph of live drives."""
         return self.file.parent / self.config.deploy.launch_file
 
-    @cached_property
+    @property
     def graph(self) -> dict[str, Any]:
         """The resolved node graph of live drives, the same on every machine, wherever it is installed.
+
+        Read each time, as the nodes read it: a launch file changed during a run does not keep the keys of the old one.
 
         Raises:
             ConfigError: There is no such launch file, or it is wrong.
