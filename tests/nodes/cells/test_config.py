@@ -243,7 +243,7 @@ def test_two_variants_in_one_run_folder_need_the_same_scene_and_policies(tmp_pat
         for each in sorted((ROOT / "launch").glob("*.experiment.yaml"))
         if "  variant:" in each.read_text()
     ]
-    assert len(shipped) == 18
+    assert len(shipped) == 19
     for each in shipped:
         loaded = load(each)
         if given_in(loaded.config):
