@@ -149,6 +149,28 @@ def test_pixels_of_the_file_are_not_taken_for_those_of_a_frame_of_another_size(t
     assert load_transforms(file).frames[1].pinhole.cx == WIDTH + 1.0
 
 
+def test_two_forms_of_one_focal_length_agree(tmp_path):
+    """As in files of colmap2nerf, which have the focal length in pixels and the angle; images of half the size have other pixels."""
+    angle = 2.0 * np.arctan(WIDTH / 2 / 30.0)
+    file = write(tmp_path, camera_angle_x=angle, x_fov=float(np.degrees(angle)))
+    assert load_transforms(file).frames[0].pinhole.fx == 30.0
+    file = write(tmp_path, fl_x=60.0, camera_angle_x=angle)
+    with pytest.raises(
+        DatasetError,
+        match=rf"every frame: fl_x: expected the lens that camera_angle_x = 0\.97.* says, 30 pixels in an image of {WIDTH}, got 60\.0; correct w",
+    ):
+        load_transforms(file)
+
+
+@pytest.mark.parametrize(("key", "side"), [("cx", WIDTH), ("cy", HEIGHT)])
+def test_a_centre_of_images_of_another_size_is_refused_where_no_size_is_given(tmp_path, key, side):
+    assert load_transforms(write(tmp_path, **{key: 0.45 * side})).frames[0].pinhole
+    with pytest.raises(DatasetError, match=rf"{key}: expected a centre near the middle .* add w and h"):
+        load_transforms(write(tmp_path, **{key: 0.5 * side / 0.75}))
+    # A crop says its size, and may have any centre.
+    assert load_transforms(write(tmp_path, w=WIDTH, h=HEIGHT, **{key: 0.7 * side})).frames[0].pinhole
+
+
 def test_cameras_of_one_set_keep_their_own_intrinsics_and_names(tmp_path):
     for name in ("phone.png", "car.png"):
         paint(tmp_path / name)
