@@ -27,8 +27,10 @@ UDACITY_FILE = "driving_log.csv"
 _UDACITY = ("center", "left", "right", "steering", "throttle", "brake", "speed")
 _CAMERAS = _UDACITY[:3]
 _FULL_RAD = math.radians(25.0)
-# Such as time, time_ms, Time [s], stamp, header.timestamp_ns; but not exposure_time, which is a duration.
-_TIMES = re.compile(r"(time|(.*[^a-z])?(time[_ ]?)?stamp)([_ ]?[mun]?s)?\s*([\[(].*)?", re.IGNORECASE)
+# Such as t, time_ms, Time [s], datetime, stamp, header.timestamp_ns; but not exposure_time, which is a duration.
+_TIMES = re.compile(
+    r"(t|(date)?time|(.*[^a-z])?(time[_ ]?)?stamp)([_ ]?[mun]?s)?\s*([\[(].*)?", re.IGNORECASE
+)
 
 
 def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
