@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -41,7 +41,7 @@ class ExpertOptions:
         typer.Option(
             exists=True,
             help="Room calibration with the reference path.",
-            show_default="the first one in the logs",
+            show_default="the one in the logs",
         ),
     ] = None
     speed_mps: Annotated[
@@ -65,17 +65,16 @@ class ExpertOptions:
     ] = 1.0
 
     def expert(self, logs: list[OpenLog]) -> Expert:
-        """The expert on the room's path, which is the path of the first log with a room unless a file is given."""
+        """The expert on the room's path: the given file's, or else the one that the logs agree on."""
         from advnerf_core.driving.expert import Expert, ExpertConfig
         from advnerf_core.driving.path import Path as DrivingPath
-        from calibration.schema import RoomCalibration
-        from nodes.lab.policy_data.recordings import attached_calibration
+        from nodes.lab.policy_data.recordings import room_of
         from nodes.runtime.errors import ConfigError
 
         config = ExpertConfig(
             speed_mps=self.speed_mps, delay_s=self.delay_s, stiffness_1pm=self.stiffness_1pm
         )
-        room: Any = attached_calibration(RoomCalibration, self.room, logs, "room")
+        room = room_of(self.room, logs)
         if room is not None:
             return Expert(room.reference_path, config)
         if any(each.labels == "expert" for each in logs):

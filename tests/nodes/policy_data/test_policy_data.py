@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from advnerf_core.data.logs.choice import LogChoice, LogError
 from advnerf_core.driving.expert import Expert
@@ -19,12 +20,12 @@ from advnerf_core.learning.frames import Frames
 from advnerf_core.learning.recipe import ImitationConfig
 from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.policies.view import PolicyView
-from calibration.schema import CameraCalibration, load_calibration, save_calibration
+from calibration.schema import CameraCalibration, RoomCalibration, load_calibration, save_calibration
 from nodes.lab.policy_data import train as training
 from nodes.lab.policy_data.evaluate import compare, predict, saliency, write_saliency
 from nodes.lab.policy_data.frames import frames_of, view_for_size, view_of
 from nodes.lab.policy_data.logs import OpenLog, open_log
-from nodes.lab.policy_data.recordings import crop_notes, policy_view, recorded_frames
+from nodes.lab.policy_data.recordings import crop_notes, policy_view, recorded_frames, room_of
 from nodes.runtime.errors import ConfigError
 
 CHOICE = LogChoice("frame", "angle", 0.5, "right")
@@ -74,6 +75,46 @@ def test_a_calibrated_camera_of_any_size_is_cropped_at_the_fraction_of_our_own(
     assert view.image(image).min() == 255
     assert view.image(255 - image).max() == 0
     assert (view.camera.fx, view.distortion) == (width, own.distortion)
+
+
+def attach(name, labels="expert", **files):
+    """A log with attached calibration files, whose pictures are of the twin's camera."""
+    contents = {
+        f"{key}.yaml": yaml.safe_dump(content.model_dump(mode="json")).encode()
+        for key, content in files.items()
+    }
+    image = np.zeros((188, 336, 3), np.uint8)
+    log = SimpleNamespace(path=Path(name), attached=lambda: contents, first_image=lambda: image)
+    return OpenLog(name, CHOICE, log, labels)
+
+
+def test_an_expert_labels_the_logs_of_one_path_only():
+    """Two rooms of the same kind: poses in the second are on another path than the first one's expert would follow."""
+    twin = load_calibration(RoomCalibration, TWIN_CAMERA.with_name("room.yaml"))
+    other = twin.model_copy(update={"path": DrivingPath.rounded_square(3.0, 0.8).to_dict()})
+    same = twin.model_copy(update={"notes": "measured again"})
+    agreed = room_of(
+        None, [attach("a", room=twin), attach("b", room=same), attach("c", "recorded", room=other)]
+    )
+    assert agreed.path == twin.path
+    logs = [attach("a", room=twin), attach("b", room=other)]
+    with pytest.raises(ConfigError, match=r"room\.yaml of a and another path in that of b; train .* --room"):
+        room_of(None, logs)
+    assert room_of(TWIN_CAMERA.with_name("room.yaml"), logs).path == twin.path
+    assert room_of(None, []) is None
+
+
+def test_a_log_of_another_lens_of_the_same_size_is_said():
+    own = load_calibration(CameraCalibration, TWIN_CAMERA)
+    tele = own.model_copy(update={"fx": 1.2 * own.fx})
+    straight = own.model_copy(update={"distortion": (0.2, 0.0, 0.0, 0.0, 0.0)})
+    logs = [attach("a", camera=own), attach("b", camera=tele), attach("c", camera=straight), attach("d")]
+    view = policy_view(None, logs)
+    assert view.camera.fx == own.fx
+    (b, c) = crop_notes(logs, view)
+    assert b.startswith(f"b: its camera.yaml has another lens (fx {1.2 * own.fx:.4g}, ")
+    assert c.startswith("c: its camera.yaml has another lens")
+    assert "distortion [0.2, 0.0, 0.0, 0.0, 0.0]" in c
 
 
 def test_our_own_camera_is_cropped_as_ever():
