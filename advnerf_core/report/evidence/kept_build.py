@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from advnerf_core.documents import read_json
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.report.evidence.registration import Registration, read_registration
 
 # Folder of the published stages, beside the sets; each has its record.
@@ -18,15 +19,20 @@ LOST = "cannot be driven again: its scene or victim was not kept"
 def is_kept(folder: Path) -> bool:
     """Whether the reference build beside a set has the scene and the victim of every scenario of it."""
     registration = read_registration(folder)
-    kept = {read_json(file).get("digest") for file in (folder.parent / BUILD).glob(f"*/{RECORD}")}
+    kept = {digest for file in (folder.parent / BUILD).glob(f"*/{RECORD}") if (digest := _digest_in(file))}
     used = _digests_used(folder, registration) if registration is not None else []
     return bool(used) and all(digest in kept for digest in used)
 
 
 def stage_problems(published: Path) -> Iterator[str]:
-    """Files of a stage that its record says are stored in the folder of another, and are not there."""
+    """Records that cannot be read, and files of a stage that its record says are stored in the folder of another, and are not there."""
     for record in sorted((published / BUILD).glob(f"*/{RECORD}")):
-        for name, folder in sorted(read_json(record).get("files_in", {}).items()):
+        try:
+            stored = sorted(read_json(record).get("files_in", {}).items())
+        except (AdvnerfError, AttributeError) as error:
+            yield f"{record}: expected the record of a stage, got what cannot be read as one; restore it from git ({error})"
+            continue
+        for name, folder in stored:
             if not (published / BUILD / folder / name).is_file():
                 yield f"{record}: {name} is stored in {folder}, and is not there; restore it from git"
 
@@ -34,6 +40,14 @@ def stage_problems(published: Path) -> Iterator[str]:
 def lost_note(folder: Path) -> list[str]:
     """A sentence for the page if the set cannot be driven again; none if it can."""
     return [] if is_kept(folder) else [f"This set {LOST}.\n"]
+
+
+def _digest_in(record: Path) -> str | None:
+    """Digest of a stage; None if its record is damaged, which `stage_problems` says."""
+    try:
+        return read_json(record).get("digest")
+    except (AdvnerfError, AttributeError):
+        return None
 
 
 def _digests_used(folder: Path, registration: Registration) -> list[str | None]:

@@ -14,6 +14,7 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from advnerf_core.report.cells import read_cells
+from advnerf_core.report.evidence.kept_build import is_kept
 from advnerf_core.report.evidence.publishing import write_page
 from advnerf_core.report.evidence.registration import (
     FILE,
@@ -515,6 +516,17 @@ def test_a_file_that_another_stage_stores_is_missed_though_the_manifest_was_writ
     assert verify_beside(published) == (
         f"{record}: views.bin is stored in scene_1, and is not there; restore it from git",
     )
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '"digest"', '{"files_in": ["views.bin"]}', "\xff\xfe"])
+def test_a_damaged_record_of_a_stage_is_one_problem(copied, content):
+    record = copied.parent / "reference/scene_0/stage.json"
+    record.write_bytes(content.encode("latin-1"))
+    write_beside(copied.parent)
+    (problem,) = verify_beside(copied.parent)
+    assert problem.startswith(f"{record}: expected the record of a stage, ")
+    assert "restore it from git" in problem
+    assert not is_kept(copied)
 
 
 def test_a_picture_of_something_else_is_found_by_drawing_it_again(copied):
