@@ -22,6 +22,8 @@ _FLAGS = {
     "two-radial": cv2.CALIB_FIX_K3,
     "three-radial": 0,
 }
+# OpenCV stops after 30 steps: with few tilted pictures, a focal length far from the best and a standard deviation that does not say so.
+_UNTIL_CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 1000, 1e-12)
 COVERAGE_CELLS = (8, 6)  # columns, rows
 # Seen face on only, a board as twice as far away in twice the focal length looks the same.
 _LEAST_TILT_RAD, _LEAST_TILTED = np.radians(12.0), 4
@@ -112,7 +114,7 @@ def _fit(views: Sequence[Detection], size: tuple[int, int], model: Model) -> _Fi
     pixels = [view.pixels.astype(np.float32) for view in views]
     try:
         rms, matrix, distortion, turns, moves, stddev, _, view_rms = cv2.calibrateCameraExtended(
-            objects, pixels, size, np.eye(3), np.zeros(5), flags=_FLAGS[model]
+            objects, pixels, size, np.eye(3), np.zeros(5), flags=_FLAGS[model], criteria=_UNTIL_CONVERGED
         )
     except cv2.error as error:
         raise DegenerateDataError(

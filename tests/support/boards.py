@@ -32,8 +32,8 @@ def turned(T, rng, turn_rad, move_m):
     )
 
 
-def board_views(rng, count, matrix, distortion, size, tilt_rad=0.5, noise_px=0.1):
-    """Views spread over the picture, the board's middle anywhere in it, turned by up to ``tilt_rad``."""
+def board_views(rng, count, matrix, distortion, size, tilt_rad=0.5, noise_px=0.1, about_y_rad=0.0):
+    """Views spread over the picture, the board's middle anywhere in it, turned by up to ``tilt_rad`` from a turn about its y."""
     middle = np.array([0.4, 0.3, 0.0])
     views = []
     while len(views) < count:
@@ -43,7 +43,7 @@ def board_views(rng, count, matrix, distortion, size, tilt_rad=0.5, noise_px=0.1
             [(pixel[0] - matrix[0, 2]) / matrix[0, 0], (pixel[1] - matrix[1, 2]) / matrix[1, 1], 1.0]
         )
         R = Rotation.from_euler(
-            "xyz", [*rng.uniform(-tilt_rad, tilt_rad, 2), rng.uniform(-0.3, 0.3)]
+            "xyz", [*rng.uniform(-tilt_rad, tilt_rad, 2) + [0.0, about_y_rad], rng.uniform(-0.3, 0.3)]
         ).as_matrix()
         found = seen(make_transform(R, ray * depth - R @ middle), matrix, distortion, size, rng, noise_px)
         if found is not None and len(found.pixels) >= 12:
