@@ -16,6 +16,7 @@ from advnerf_core.aruco import marker_dictionary
 from advnerf_core.attack.printing.frame import CELLS, DICTIONARY
 from advnerf_core.geometry import Array
 from advnerf_core.srgb import to_linear
+from advnerf_core.undistortion import ray_slopes
 from calibration.degeneracy import DegenerateDataError
 from calibration.schema import Intrinsics
 
@@ -124,7 +125,10 @@ def _located(light: NDArray[np.float32], lens: Intrinsics, rough: Array) -> Arra
         if len(points) < _LEAST_SAMPLES:
             return "an edge has too little contrast: it is in shadow, overexposed or covered"
         blurs.append(blur_px)
-        lines.append(_line(undistorted(points + 0.5, lens)))
+        ideal = undistorted(points + 0.5, lens)
+        if not np.isfinite(ideal).all():
+            return "the lens's coefficients say nothing of where it is: hold it nearer to the middle, or calibrate the lens with the board there"
+        lines.append(_line(ideal))
     blur_px = float(np.median(blurs))
     if blur_px > _MOST_BLUR_CELLS * cell_px:
         return f"edges are blurred by {blur_px:.1f} px at cells of {cell_px:.1f} px: it is out of focus, or the camera moved"
@@ -133,13 +137,9 @@ def _located(light: NDArray[np.float32], lens: Intrinsics, rough: Array) -> Arra
 
 
 def undistorted(pixels: Array, lens: Intrinsics) -> Array:
-    """Pixels ``[N, 2]`` of a lens as its pinhole would draw them."""
+    """Pixels ``[N, 2]`` of a lens as its pinhole would draw them; NaN where the lens draws nothing."""
     matrix = lens.pinhole.matrix
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-    found = cv2.undistortPointsIter(
-        pixels.reshape(-1, 1, 2), matrix, np.array(lens.distortion), np.eye(3), matrix, criteria
-    )
-    return np.asarray(found, np.float64).reshape(-1, 2)
+    return ray_slopes(pixels, matrix, lens.distortion) @ matrix[:2, :2].T + matrix[:2, 2]
 
 
 def _edge(light: NDArray[np.float32], start: Array, end: Array) -> tuple[Array, float]:

@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from advnerf_core.geometry import Array
+from advnerf_core.undistortion import ray_slopes
 from calibration.degeneracy import DegenerateDataError, PoorFitError, mean_rotation, require_count
 from calibration.measured import TimeOffsetCalibration
 from calibration.schema import CameraCalibration
@@ -198,7 +199,10 @@ def _turn(first: NDArray[np.uint8], second: NDArray[np.uint8], camera: CameraCal
     if kept.sum() < _LEAST_TRACKED:
         return None
     a, b = (_directions(points.reshape(-1, 2)[kept] + 0.5, camera) for points in (corners, moved))
-    R = _rotation(a, b)
+    known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    if known.sum() < _LEAST_TRACKED:
+        return None
+    R = _rotation(a[known], b[known])
     if R is None:
         return None
     # R takes directions of the first camera to the second; the camera itself turned the other way.
@@ -207,9 +211,8 @@ def _turn(first: NDArray[np.uint8], second: NDArray[np.uint8], camera: CameraCal
 
 
 def _directions(pixels: Array, camera: CameraCalibration) -> Array:
-    points = cv2.undistortPoints(
-        pixels.reshape(-1, 1, 2).astype(np.float64), camera.pinhole.matrix, np.array(camera.distortion)
-    ).reshape(-1, 2)
+    """Unit vectors ``[N, 3]``; NaN where the lens has none."""
+    points = ray_slopes(pixels, camera.pinhole.matrix, camera.distortion)
     rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.geometry import Array, Pinhole, transform_points
+from advnerf_core.undistortion import ray_slopes
 
 NEAR_M = 0.02  # as in the surrogate: anything nearer to the camera is not drawn
 _CORNER_TOLERANCE_M = 0.02  # measured corners may be this far from a parallelogram; the nearest one is drawn
@@ -182,7 +183,6 @@ def _sample_rays(
         x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
         return x[None].astype(np.float32), y[:, None].astype(np.float32)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 1, 2)
-    rays = cv2.undistortPoints(grid, camera.matrix, np.asarray(distortion, dtype=np.float64)).reshape(
-        len(v), len(u), 2
-    )
+    # NaN where no ray arrives: such a sample is never inside a face.
+    rays = ray_slopes(grid, camera.matrix, distortion).reshape(len(v), len(u), 2)
     return np.ascontiguousarray(rays[..., 0], np.float32), np.ascontiguousarray(rays[..., 1], np.float32)

@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
+from advnerf_core.errors import ConfigError
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.srgb import to_display, to_linear
 from advnerf_core.strict import StrictModel
+from advnerf_core.undistortion import ray_slopes
 
 Rgb = NDArray[np.uint8]
 _Linear = NDArray[np.float32]
@@ -212,8 +214,13 @@ def _distortion(pinhole: Pinhole, k1: float, k2: float) -> tuple[_Linear, _Linea
     # OpenCV's pixel centres are at whole numbers, a pinhole's at halves.
     K[:2, 2] -= 0.5
     columns, rows = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
-    points = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
-    ideal = cv2.undistortPoints(points, K, np.array([k1, k2, 0.0, 0.0]), P=K)
+    points = np.stack([columns, rows], axis=-1).reshape(-1, 2)
+    slopes = ray_slopes(points, K, (k1, k2, 0.0, 0.0, 0.0))
+    if not np.isfinite(slopes).all():
+        raise ConfigError(
+            f"expected k1 and k2 of a lens that draws the whole picture, got {k1:g} and {k2:g}, which fold it over itself; make them smaller"
+        )
+    ideal = slopes @ K[:2, :2].T + K[:2, 2]
     where = ideal.reshape(pinhole.height, pinhole.width, 2).astype(np.float32)
     return where[..., 0], where[..., 1]
 

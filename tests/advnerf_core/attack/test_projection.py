@@ -134,6 +134,30 @@ def test_distortion_moves_the_face_as_opencv_projects_it():
     assert np.abs(image[..., 0].astype(float) - expected).mean() < 0.5
 
 
+@pytest.mark.parametrize("angle_deg", [40, 54, 65, 80])
+def test_a_face_at_the_edge_of_a_wide_lens_is_drawn_where_opencv_projects_it(angle_deg):
+    """At 80 degrees it is outside the picture, where too few steps of undistortion had drawn a ghost of it."""
+    distortion, camera = (-0.3, 0.09, 0.0, 0.0, 0.0), Pinhole(320, 240, 100.0, 100.0, 160.0, 120.0)
+    away = np.array([np.sin(np.radians(angle_deg)), 0.0, np.cos(np.radians(angle_deg))])
+    up = np.array([0.0, -1.0, 0.0])
+    T = make_transform(np.stack([-away, np.cross(up, -away), up], axis=1), 1.2 * away)
+    corners = np.array([[0, -0.15, 0.15], [0, 0.15, 0.15], [0, 0.15, -0.15], [0, -0.15, -0.15]])
+    overlay = FaceOverlay(np.full((8, 8, 3), 255, np.uint8), corners, camera, distortion, 2)
+    drawn, _ = overlay.draw(np.zeros((240, 320, 3), np.uint8), T)
+    t = np.linspace(0.0, 1.0, 40)[:, None]
+    edge = np.concatenate(
+        [a + t * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    )
+    outline, _ = cv2.projectPoints(
+        transform_points(T, edge), np.zeros(3), np.zeros(3), camera.matrix, np.array(distortion)
+    )
+    expected = np.zeros((240 * 8, 320 * 8), np.uint8)
+    cv2.fillPoly(expected, [np.round(outline.reshape(-1, 2) * 8).astype(np.int32)], 255)
+    expected = cv2.resize(expected, (320, 240), interpolation=cv2.INTER_AREA)
+    assert (angle_deg == 80) == (not expected.any())
+    assert np.abs(drawn[..., 0].astype(float) - expected).mean() < 0.3
+
+
 def test_a_fine_pattern_far_away_is_averaged_not_aliased():
     checker = (np.indices((512, 512)).sum(axis=0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, axis=2)
     T_camera_from_face = make_transform([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], [0.0, 0.0, 5.0])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
+from advnerf_core.errors import ConfigError
 from advnerf_core.geometry import Pinhole
 from hardware.cameras import effects
 from hardware.cameras.effects import PRESETS, CameraEffects, Effects, ImperfectCamera
@@ -118,6 +119,13 @@ def test_a_point_is_where_opencv_projects_it():
         expected, _ = cv2.projectPoints(np.array([[x, y, 1.0]]), STILL, STILL, K, np.array([k1, k2, 0, 0]))
         assert centre == pytest.approx(expected.ravel(), abs=0.15)
         assert np.abs(expected.ravel() - ideal).max() > 0.2  # there is something to see
+
+
+def test_a_lens_that_folds_its_picture_is_refused():
+    with pytest.raises(
+        ConfigError, match=r"k1 and k2 of a lens that draws the whole picture, got -1 and 0, .* smaller"
+    ):
+        ImperfectCamera(CameraEffects(k1=-1.0), PINHOLE)
 
 
 def test_frames_are_lost_as_often_as_asked_but_never_the_first():
