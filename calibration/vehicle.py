@@ -4,7 +4,8 @@ While servo and motor command are constant the car moves with a constant twist: 
 by least squares over its poses, the yaw rate ``w`` and the velocity of the tracked point in the body's frame ``(vx, vy)``. Then:
 
 - the rear axle is the point without sideways velocity. A point ``a`` ahead of it and ``b`` to its left, on a body whose marked x axis is
-  turned by ``e``, moves with ``vx = v - b w`` and ``vy = a w - e v``, so all segments together give ``a`` and ``e``;
+  turned by ``e``, moves along that body's axes with ``vx = v cos(e) + a w sin(e)`` and ``vy = a w cos(e) - v sin(e)`` for ``b = 0``, so that
+  ``vy = a w / cos(e) - vx tan(e)``: all segments together give ``a`` and ``e``;
 - the curvature ``k = w / v`` gives the wheel angle ``d = atan(L k)``, and a line through the segments' ``(d, servo)`` gives gain and offset.
   The wheelbase ``L`` is measured with a ruler: fitted together with the gain it could be anything;
 - a line through the segments' ``(v, erpm)`` gives the speed gain.
@@ -14,6 +15,7 @@ Delay and lag come from how the same drive changes between the segments: `calibr
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -41,6 +43,8 @@ _LEAST_CURVATURE_1PM = 0.3
 _STRAIGHT_1PM = 0.12
 # A larger scatter of the wheel angles about the line is refused [rad].
 _MOST_STEERING_RMS_RAD = 0.02
+# A subject that is turned farther about its z axis is refused: every heading is wrong by as much [rad].
+_MOST_TURNED_RAD = math.radians(10.0)
 # A larger relative scatter of the speeds about the line is refused.
 _MOST_SPEED_RMS = 0.05
 
@@ -155,9 +159,12 @@ def fit_gains(drive: RecordedDrive, wheelbase_m: float) -> GainsFit:
     _require_variety(segments)
     w = np.array([s.yaw_rate_radps for s in segments])
     vx, vy = (np.array([getattr(s, name) for s in segments]) for name in ("vx_mps", "vy_mps"))
-    (ahead, turned), _ = linear_fit(np.stack([w, -vx], axis=1), vy)
-    # Speed of the tracked point along the rear axle's path; b cannot be separated from the gain's asymmetry and is set to 0.
-    speed = vx * np.cos(turned) - (vy - ahead * w) * np.sin(turned)
+    (ahead_slope, tangent), _ = linear_fit(np.stack([w, -vx], axis=1), vy)
+    turned = float(np.arctan(tangent))
+    _require_forward(turned)
+    ahead = float(ahead_slope * np.cos(turned))
+    # Speed of the rear axle; an offset to the side cannot be separated from the gain's asymmetry and is set to 0.
+    speed = vx * np.cos(turned) - vy * np.sin(turned)
     steering = np.arctan(wheelbase_m * w / speed)
     servo, erpm = (np.array([getattr(s, name) for s in segments]) for name in ("servo", "erpm"))
     # The servo value is exact, the angle is measured: angle over servo, then inverted.
@@ -186,6 +193,15 @@ def fit_gains(drive: RecordedDrive, wheelbase_m: float) -> GainsFit:
     )
     _require_lines(fit)
     return fit
+
+
+def _require_forward(turned_rad: float) -> None:
+    if abs(turned_rad) > _MOST_TURNED_RAD:
+        side = "left" if turned_rad > 0.0 else "right"
+        raise PoorFitError(
+            f"expected a subject whose x axis points forward, got one {np.degrees(abs(turned_rad)):.0f} degrees to the {side} of the way that the car "
+            "drives; turn the subject in Tracker, or every heading is wrong"
+        )
 
 
 def find_segments(drive: RecordedDrive) -> list[Segment]:

@@ -24,6 +24,9 @@ from calibration.vehicle import GainsFit, RecordedDrive
 GRID_S, WINDOW = 0.01, 6  # the window in steps of the grid
 _DELAYS_S = np.arange(0.0, 0.41, 0.02)
 _SLEW_RANGE = (0.3, 30.0)
+_DELAY_RANGE_S = (-0.1, 0.6)
+# On one clock, stamps of commands and of poses are good to a few milliseconds.
+_EARLY_S = 0.01
 # A stop is not first order: the following motion counts again after this time.
 _AFTER_STOP_S = 1.0
 # Fewer changes of the command are refused.
@@ -155,8 +158,18 @@ def _after(
 def vehicle_calibration(
     gains: GainsFit, response: ResponseFit, before: VehicleCalibration
 ) -> VehicleCalibration:
-    """Make the vehicle calibration, with servo range and limits of the given file."""
+    """Make the vehicle calibration, with servo range and limits of the given file.
+
+    Raises:
+        PoorFitError: A gain has the other sign than the file that the drive was made with.
+    """
     g, steering, speed = before.gains, response.steering, response.speed
+    _require_sign(
+        "erpm_per_mps", gains.erpm_per_mps, g.erpm_per_mps, "does the subject's x axis point backwards"
+    )
+    _require_sign(
+        "servo_per_rad", gains.servo_per_rad, g.servo_per_rad, "do the poses have x forward, y left and z up"
+    )
     residuals = {
         "steering_rms_rad": gains.steering_rms_rad,
         "speed_rms_mps": gains.speed_rms_mps,
@@ -190,6 +203,14 @@ def vehicle_calibration(
     )
 
 
+def _require_sign(name: str, found: float, before: float, first_guess: str) -> None:
+    if found * before < 0.0:
+        raise PoorFitError(
+            f"expected {name} of the sign that the car drove with, {before:.4g}, got {found:.4g}: {first_guess}? If the car does drive the "
+            "other way, correct the sign in the file of --before and record the drive again"
+        )
+
+
 def _require_changes(values: Array, least: float, needed: int, what: str, unit: str) -> None:
     steps = np.abs(np.diff(values))
     found = int((steps >= least).sum())
@@ -203,10 +224,10 @@ def _require_changes(values: Array, least: float, needed: int, what: str, unit: 
 def _motion(drive: RecordedDrive, gains: GainsFit, grid: Array) -> tuple[Array, Array]:
     """Yaw and distance of the rear axle on the grid ``[K]``."""
     yaw = np.interp(grid, drive.pose_s, drive.poses[:, 2])
-    c, s = np.cos(yaw), np.sin(yaw)
-    x = np.interp(grid, drive.pose_s, drive.poses[:, 0]) - gains.origin_ahead_m * c
-    y = np.interp(grid, drive.pose_s, drive.poses[:, 1]) - gains.origin_ahead_m * s
-    middle = 0.5 * (yaw[1:] + yaw[:-1]) - gains.axis_turned_rad
+    heading = yaw - gains.axis_turned_rad
+    x = np.interp(grid, drive.pose_s, drive.poses[:, 0]) - gains.origin_ahead_m * np.cos(heading)
+    y = np.interp(grid, drive.pose_s, drive.poses[:, 1]) - gains.origin_ahead_m * np.sin(heading)
+    middle = 0.5 * (heading[1:] + heading[:-1])
     steps = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle)
     return yaw, np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -249,14 +270,13 @@ def _fit(
         return _windows(model(float(p[0]), float(p[1]), slew))[kept] - change
 
     first = float(min(_DELAYS_S, key=lambda delay: float(np.sum(residuals(np.array([delay, 0.08])) ** 2))))
-    low, high = [-0.1, 1e-3], [0.6, 2.0]
+    low, high = [_DELAY_RANGE_S[0], 1e-3], [_DELAY_RANGE_S[1], 2.0]
     plain = least_squares(residuals, [first, 0.08], bounds=(low, high), x_scale=[0.02, 0.05])
     found, slew = plain, None
     if with_slew:
         bounds = ([*low, np.log(_SLEW_RANGE[0])], [*high, np.log(_SLEW_RANGE[1])])
-        limited = least_squares(
-            residuals, _slew_start(residuals, plain.x), bounds=bounds, x_scale=[0.02, 0.05, 0.3]
-        )
+        start = np.clip(_slew_start(residuals, plain.x), *bounds)
+        limited = least_squares(residuals, start, bounds=bounds, x_scale=[0.02, 0.05, 0.3])
         if limited.cost < 0.98 * plain.cost and np.exp(limited.x[2]) < 0.95 * _SLEW_RANGE[1]:
             found, slew = limited, float(np.exp(limited.x[2]))
     unexplained = float(2.0 * found.cost / np.sum((change - change.mean()) ** 2))
@@ -268,6 +288,7 @@ def _fit(
     # Windows overlap WINDOW times, so that many fewer of them are independent.
     covariance = np.linalg.pinv(found.jac.T @ found.jac) * 2.0 * found.cost / len(change) * WINDOW
     delay_sd, lag_sd = np.sqrt(np.diag(covariance))[:2]
+    _require_one_clock(float(found.x[0]), float(delay_sd), what)
     middles = grid[WINDOW // 2 : WINDOW // 2 + len(kept)][kept]
     return Followed(
         max(float(found.x[0]), 0.0),
@@ -280,6 +301,20 @@ def _fit(
         change,
         change + residuals(found.x),
     )
+
+
+def _require_one_clock(delay_s: float, stddev_s: float, what: str) -> None:
+    """Raise for a motion before its command, and for a delay at the end of the search."""
+    low, high = _DELAY_RANGE_S
+    early, late = delay_s < -(2.0 * stddev_s + _EARLY_S), delay_s > high - 0.01 * (high - low)
+    if early or late:
+        got = (
+            f"{1000.0 * -delay_s:.0f} ms or more before" if early else f"{1000.0 * high:.0f} ms or more after"
+        )
+        raise PoorFitError(
+            f"expected {what} that follows its commands, got motion {got} them; are commands and poses on one clock? Synchronise the computers, "
+            "or correct vicon.latency_s"
+        )
 
 
 def _slew_start(residuals: Callable[[Array], Array], plain: Array) -> Array:

@@ -197,6 +197,8 @@ def vehicle(
     ] = None,
 ) -> None:
     """Calibrate speed gain, servo gain and offset, rear axle, delay and lag from circles, straight runs and steps."""
+    import numpy as np
+
     from calibration.plots import vehicle_plot
     from calibration.schema import VehicleCalibration, load_calibration
     from calibration.vehicle import fit_gains
@@ -217,6 +219,10 @@ def vehicle(
     if abs(ahead) > 10.0:
         print(
             f"the subject's origin is {ahead:.0f} mm ahead of the rear axle. Move it to the rear axle in Tracker, or every cross-track error is wrong"
+        )
+    if abs(turned := np.degrees(gains.axis_turned_rad)) > 1.0:
+        print(
+            f"the subject's x axis is turned by {turned:.1f} degrees to the left of the car's. Turn it in Tracker, or every heading is wrong by as much"
         )
     if new.response is not None:
         values = ", ".join(f"{key}: {value}" for key, value in new.response.attack_dynamics().items())

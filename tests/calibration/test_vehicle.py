@@ -1,6 +1,7 @@
 """Gains, rear axle, delay and lag of the simulated car, whose truth is in its configuration; poor drives refused with the reason."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -136,6 +137,61 @@ def test_a_stop_on_the_way_does_no_harm(gains):
     recorded = drive(np.random.default_rng(6), rows)
     fit = fit_response(recorded, fit_gains(recorded, CAR.wheelbase_m))
     assert fit.speed.lag_s == pytest.approx(CAR.motor_lag_s, rel=0.1)
+
+
+@pytest.mark.parametrize("turned_deg", [-8.0, 6.0])
+def test_a_subject_turned_about_its_z_axis_changes_no_gain(turned_deg):
+    turned = drive(np.random.default_rng(0), ahead_m=0.2, turned_rad=math.radians(turned_deg))
+    gains = fit_gains(turned, CAR.wheelbase_m)
+    assert gains.axis_turned_rad == pytest.approx(math.radians(turned_deg), abs=0.003)
+    assert gains.origin_ahead_m == pytest.approx(0.2, abs=0.003)
+    assert gains.servo_per_rad == pytest.approx(CAR.true_servo_gain, rel=0.01)
+    assert gains.erpm_per_mps == pytest.approx(CAR.true_erpm_gain, rel=0.005)
+    fit = fit_response(turned, gains)
+    assert fit.steering.delay_s + fit.steering.lag_s == pytest.approx(0.03 + CAR.steering_lag_s, abs=0.008)
+
+
+@pytest.mark.parametrize(
+    ("turned_deg", "side"), [(20.0, "20 degrees to the left"), (-45.0, "45 degrees to the right")]
+)
+def test_a_subject_turned_far_is_refused(turned_deg, side):
+    turned = drive(np.random.default_rng(0), turned_rad=math.radians(turned_deg))
+    with pytest.raises(PoorFitError, match=f"{side} of the way that the car drives; turn the subject"):
+        fit_gains(turned, CAR.wheelbase_m)
+
+
+def mirrored(recorded):
+    return replace(recorded, poses=recorded.poses * [1.0, -1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda each: replace(each, poses=each.poses + [0.0, 0.0, math.pi]), "erpm_per_mps .* backwards"),
+        (mirrored, "servo_per_rad .* y left and z up"),
+    ],
+)
+def test_a_gain_of_the_other_sign_is_refused(good, change, named):
+    """A car that is told to drive forward with such a file drives backwards, or into the inside of a corner."""
+    other = change(good)
+    gains = fit_gains(other, CAR.wheelbase_m)
+    response = fit_response(other, gains)
+    with pytest.raises(PoorFitError, match=rf"expected {named}\? If the car does drive the other way"):
+        vehicle_calibration(gains, response, twin_calibrations(LabConfig())["vehicle"])
+
+
+@pytest.mark.parametrize(
+    ("shift_s", "said"),
+    [
+        (-0.06, "before them"),
+        (-0.1, "before them"),
+        (-0.3, "before them"),
+        (0.7, "600 ms or more after them"),
+    ],
+)
+def test_commands_and_poses_of_two_clocks_are_refused(good, gains, shift_s, said):
+    with pytest.raises(PoorFitError, match=f"{said}; are commands and poses on one clock|on one clock"):
+        fit_response(replace(good, pose_s=good.pose_s + shift_s), gains)
 
 
 def test_the_file_round_trip_and_what_the_attack_takes_from_it(good, gains, tmp_path):
