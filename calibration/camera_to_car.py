@@ -33,7 +33,7 @@ from calibration.degeneracy import (
 )
 from calibration.measured import LensCalibration, rows_of
 from calibration.mount_problem import MountProblem
-from calibration.schema import CameraCalibration
+from calibration.schema import CalibrationError, CameraCalibration
 
 _CONTRADICTION = "did car and board stand still at the stamps, and is the subject the one the camera is on?"
 # Fewer agreeing views are refused.
@@ -46,6 +46,8 @@ _OUTLIER_FACTOR = 6.0
 _MOST_SHARE_LEFT_OUT = 0.4
 # A larger reprojection error through the whole chain is refused [px].
 _MOST_RMS_PX = 2.0
+# Half a percent of a metre is 5 mm, several times what a careful set leaves.
+_MOST_STRETCH = 0.005
 # With a larger median angle between the views' mounting poses and their mean the set is refused [rad].
 _MOST_MEDIAN_RAD = 0.05
 # Or a larger median distance [m].
@@ -95,14 +97,18 @@ class MountFit:
         return float(np.sqrt(np.mean(self.view_rms_px[self.used] ** 2)))
 
     def calibration(self, camera: LensCalibration) -> CameraCalibration:
-        """Make the camera calibration."""
+        """Make the camera calibration.
+
+        Raises:
+            PoorFitError: The camera does not look ahead, upright.
+        """
         residuals = {
             "rms_px": self.rms_px,
             "views_left_out": float((~self.used).sum()),
             "rotation_stddev_deg": float(np.degrees(self.rotation_stddev_rad)),
             "translation_stddev_m": self.translation_stddev_m,
         }
-        return CameraCalibration(
+        made = CameraCalibration(
             date=datetime.date.today(),
             method=self.method,
             views=int(self.used.sum()),
@@ -113,6 +119,13 @@ class MountFit:
                 key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy", "distortion")
             },
         )
+        try:
+            made.mount  # noqa: B018  # everything that reads the file asks for it
+        except CalibrationError as error:
+            raise PoorFitError(
+                f"{error}; does the subject's x axis point forward and its z axis up?"
+            ) from error
+        return made
 
 
 def calibrate_mount(
@@ -149,6 +162,7 @@ def calibrate_mount(
     X, Y, inside = _start(T_base_from_car, T_camera_from_pattern, known)
     problem = MountProblem(T_base_from_car, [view.found for view in chosen], matrix, distortion, known)
     X, Y, turn_stddev, move_stddev = problem.solve(X, Y, inside)
+    _require_size(*problem.stretch(X, Y, inside))
     rms = problem.view_rms(X, Y)
     used, all_rms = np.zeros(len(views), np.bool_), np.full(len(views), np.nan)
     used[np.flatnonzero(good)[inside]], all_rms[good] = True, rms
@@ -159,6 +173,15 @@ def calibrate_mount(
             "car and board stand still, is the lens this camera's, the square size right, the subject's axes those of the car?"
         )
     return fit
+
+
+def _require_size(stretch: float, stddev: float) -> None:
+    if abs(stretch) > max(_MOST_STRETCH, 4.0 * stddev):
+        how = "larger" if stretch > 0.0 else "smaller"
+        raise PoorFitError(
+            f"expected squares of the given size, got some that look {100.0 * abs(stretch):.1f} % {how} to motion capture: measure --square on the "
+            "print, which printers scale, and calibrate the lens at this resolution; a focal length that is wrong by as much looks the same"
+        )
 
 
 def _method(tracked: bool, known: bool) -> str:

@@ -38,23 +38,33 @@ class MountProblem:
 
     def solve(self, X: Array, Y: Array, inside: NDArray[np.bool_]) -> tuple[Array, Array, float, float]:
         """Refined X and Y, and the standard deviations of X's rotation [rad] and translation [m]."""
+        found, covariance = self._fit(X, Y, inside, with_stretch=False)
+        turn, move = (np.sqrt(np.linalg.eigvalsh(covariance[a : a + 3, a : a + 3])[-1]) for a in (0, 3))
+        return *self._moved(X, Y, found), float(turn), float(move)
+
+    def stretch(self, X: Array, Y: Array, inside: NDArray[np.bool_]) -> tuple[float, float]:
+        """Factor by which the board looks larger than it is said to be, minus 1, and its standard deviation."""
+        found, covariance = self._fit(X, Y, inside, with_stretch=True)
+        return float(found[-1]), float(np.sqrt(covariance[-1, -1]))
+
+    def _fit(self, X: Array, Y: Array, inside: NDArray[np.bool_], with_stretch: bool) -> tuple[Array, Array]:
+        """Parameters of the best fit near X and Y, the board's stretch last if it is one of them, and their covariance."""
         rows = np.flatnonzero(inside)
         factors = [self._factor(X, Y, row) for row in rows]
 
         def residuals(p: Array) -> Array:
             A, B = self._moved(X, Y, p)
-            each = (self._errors(A, B, row).ravel() for row in rows)
+            larger = 1.0 + p[-1] if with_stretch else 1.0
+            each = (self._errors(A, B, row, larger=larger).ravel() for row in rows)
             return np.concatenate(
                 [solve_triangular(f, e, lower=True) for f, e in zip(factors, each, strict=True)]
             )
 
-        size = 6 if self._known is not None else 12
+        size = (6 if self._known is not None else 12) + with_stretch
         found = least_squares(residuals, np.zeros(size), x_scale="jac")
         # Scaled by the residuals, so that a larger noise than stated is not hidden.
         scale = 2.0 * found.cost / (len(found.fun) - size)
-        covariance = np.linalg.pinv(found.jac.T @ found.jac) * max(scale, 1.0)
-        turn, move = (np.sqrt(np.linalg.eigvalsh(covariance[a : a + 3, a : a + 3])[-1]) for a in (0, 3))
-        return *self._moved(X, Y, found.x), float(turn), float(move)
+        return found.x, np.linalg.pinv(found.jac.T @ found.jac) * max(scale, 1.0)
 
     def view_rms(self, X: Array, Y: Array) -> Array:
         """Reprojection error of each view ``[N]`` [px]."""
@@ -80,12 +90,14 @@ class MountProblem:
         return np.asarray(np.linalg.cholesky(covariance))
 
     def _moved(self, X: Array, Y: Array, p: Array) -> tuple[Array, Array]:
-        return X @ small_motion(p[:6]), Y if self._known is not None else Y @ small_motion(p[6:])
+        return X @ small_motion(p[:6]), Y if self._known is not None else Y @ small_motion(p[6:12])
 
-    def _errors(self, X: Array, Y: Array, row: int, T_base_from_car: Array | None = None) -> Array:
+    def _errors(
+        self, X: Array, Y: Array, row: int, T_base_from_car: Array | None = None, larger: float = 1.0
+    ) -> Array:
         A = self._T_base_from_car[row] if T_base_from_car is None else T_base_from_car
         T = invert_transform(A @ X) @ Y
-        points = self._found[row].board_m @ T[:3, :3].T + T[:3, 3]
+        points = larger * self._found[row].board_m @ T[:3, :3].T + T[:3, 3]
         predicted = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self._matrix, self._distortion)[0]
         return np.asarray(predicted.reshape(-1, 2) - self._found[row].pixels)
 

@@ -168,7 +168,7 @@ def camera_to_car(
     from calibration.charuco import BoardDetector
     from calibration.plots import mount_plot
     from nodes.lab.wizards.bags import CAR, IMAGES, still_views
-    from nodes.lab.wizards.lens import load_lens
+    from nodes.lab.wizards.lens import load_lens, with_kept
 
     keep_inputs(output, source, lens, pattern)
     detector = BoardDetector(options.board())
@@ -178,7 +178,10 @@ def camera_to_car(
     views, frames = still_views(bag, detector, tracked)
     print(f"{len(views)} stops with the board in view among {frames} frames")
     fit = calibrate_mount(views, camera, None if pattern is None else _transform(pattern))
-    save_and_print(fit.calibration(camera), output, lambda figure: mount_plot(figure, fit))
+    new = with_kept(fit.calibration(camera), output)
+    save_and_print(new, output, lambda figure: mount_plot(figure, fit))
+    if new.latency_s:
+        print(f"latency_s {new.latency_s:g} is kept from the old file")
 
 
 @app.command("vehicle")

@@ -1,5 +1,7 @@
 """A mounting pose found again from noisy boards and poses; planar, contradictory and short sets refused with the reason."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import camera_mount, invert_transform, make_transform, planar_pose
 from calibration.camera_to_car import MountView, calibrate_mount
+from calibration.charuco import Detection
 from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.measured import LensCalibration
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
@@ -140,3 +143,32 @@ def test_the_file_is_a_camera_and_survives_a_round_trip(tmp_path):
     assert loaded == calibration
     np.testing.assert_allclose(loaded.mount, fit.T_car_from_camera, atol=1e-9)
     assert loaded.residuals["translation_stddev_m"] > 0.0
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+@pytest.mark.parametrize(
+    ("square", "focal", "percent"),
+    [(1.02, 1.0, r"2\.\d % smaller|1\.9 % smaller"), (0.98, 1.0, "% larger"), (1.0, 1.05, "% smaller")],
+)
+def test_a_board_of_another_size_and_a_lens_of_another_length_are_refused(tracked, square, focal, percent):
+    """Both had passed: 2 % of the squares moves the camera by 13 mm and more, and the stated standard deviation is below 1 mm."""
+    found = views(np.random.default_rng(0), tracked=tracked)
+    said = [replace(each, found=Detection(square * each.found.board_m, each.found.pixels)) for each in found]
+    lens = LENS.model_copy(update={"fx": focal * LENS.fx, "fy": focal * LENS.fy})
+    with pytest.raises(
+        PoorFitError, match=rf"({percent}) to motion capture: measure --square .* focal length"
+    ):
+        calibrate_mount(said, lens)
+
+
+def test_a_subject_that_points_backwards_gives_no_file():
+    """All that reads a camera's file would refuse it."""
+    back = make_transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    found = [
+        replace(each, T_world_from_car=each.T_world_from_car @ back)
+        for each in views(np.random.default_rng(0))
+    ]
+    with pytest.raises(
+        PoorFitError, match=r"looks ahead, upright, .* does the subject's x axis point forward"
+    ):
+        calibrate_mount(found, LENS).calibration(LENS)

@@ -167,7 +167,10 @@ def mirrored(recorded):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (lambda each: replace(each, poses=each.poses + [0.0, 0.0, math.pi]), "erpm_per_mps .* backwards"),
+        (
+            lambda each: replace(each, poses=each.poses + np.array([0.0, 0.0, math.pi])),
+            "erpm_per_mps .* backwards",
+        ),
         (mirrored, "servo_per_rad .* y left and z up"),
     ],
 )

@@ -263,6 +263,15 @@ def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
     np.testing.assert_allclose(found.mount[:3, 3], mount[:3, 3], atol=0.004)
     assert (tmp_path / "camera.png").exists()
     capsys.readouterr()
+    # A camera that is mounted anew keeps the delay of its stamps, and what was noted.
+    save_calibration(
+        found.model_copy(update={"latency_s": 0.06, "notes": "left socket"}), tmp_path / "camera.yaml"
+    )
+    bag = tmp_path / "bag"
+    assert run("car", "calibrate", "camera-to-car", bag, *options, "-o", tmp_path / "camera.yaml") == 0
+    assert "latency_s 0.06 is kept" in capsys.readouterr().out
+    again = load_calibration(CameraCalibration, tmp_path / "camera.yaml")
+    assert (again.latency_s, again.notes, again.mount.tolist()) == (0.06, "left socket", found.mount.tolist())
     # The car itself only drove on the floor: without the board's poses the same bag fixes nothing.
     assert (
         run(

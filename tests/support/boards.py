@@ -43,7 +43,8 @@ def board_views(rng, count, matrix, distortion, size, tilt_rad=0.5, noise_px=0.1
             [(pixel[0] - matrix[0, 2]) / matrix[0, 0], (pixel[1] - matrix[1, 2]) / matrix[1, 1], 1.0]
         )
         R = Rotation.from_euler(
-            "xyz", [*rng.uniform(-tilt_rad, tilt_rad, 2) + [0.0, about_y_rad], rng.uniform(-0.3, 0.3)]
+            "xyz",
+            [*(rng.uniform(-tilt_rad, tilt_rad, 2) + np.array([0.0, about_y_rad])), rng.uniform(-0.3, 0.3)],
         ).as_matrix()
         found = seen(make_transform(R, ray * depth - R @ middle), matrix, distortion, size, rng, noise_px)
         if found is not None and len(found.pixels) >= 12:

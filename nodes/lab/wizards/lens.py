@@ -1,4 +1,4 @@
-"""Reads a lens from either of the two files that have one."""
+"""Reads a lens from either of the two files that have one, and keeps what a new mounting pose does not change."""
 
 from __future__ import annotations
 
@@ -24,3 +24,15 @@ def load_lens(file: Path) -> LensCalibration:
         except CalibrationError:
             raise error from None
     return LensCalibration(**{key: getattr(camera, key) for key in _FIELDS})
+
+
+def with_kept(new: CameraCalibration, file: Path) -> CameraCalibration:
+    """The calibration with ``latency_s`` and ``notes`` of the camera file that it replaces, if there is one.
+
+    Raises:
+        CalibrationError: The file is no camera file.
+    """
+    if not file.exists():
+        return new
+    old = load_calibration(CameraCalibration, file)
+    return new.model_copy(update={"latency_s": old.latency_s, "notes": old.notes})
