@@ -9,7 +9,7 @@ What the camera moves sideways while it turns looks like more turning, in propor
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -29,6 +29,8 @@ _MOST_CORNERS, _LEAST_TRACKED = 300, 25
 _INLIER_RAD, _ROUNDS = 0.01, 8
 # Poses are smoothed over this long before they are differentiated; it is symmetric and moves nothing.
 _SMOOTH_S = 0.05
+# Turns near a longer stretch without poses are left out [s].
+_GAP_S = 0.1
 # The offset is searched between minus and plus this [s].
 _LARGEST_S = 0.4
 # Step of the search [s].
@@ -144,6 +146,10 @@ def fit_offset(turns: Turns, pose_s: Array, yaw_rad: Array) -> OffsetFit:
     )
     reach = _LARGEST_S + _SMOOTH_S
     inside = (turns.start_s > pose_s[0] + reach) & (turns.end_s < pose_s[-1] - reach)
+    for lost, found in _gaps(
+        pose_s
+    ):  # the car was hidden: no turn near by is known, at no shift of the search
+        inside &= (turns.end_s < lost - reach) | (turns.start_s > found + reach)
     turns = Turns(turns.start_s[inside], turns.end_s[inside], turns.yaw_rad[inside])
     require_count(
         len(turns.yaw_rad),
@@ -231,6 +237,13 @@ def _rotation(a: Array, b: Array) -> Array | None:
             break
         inside = again
     return R
+
+
+def _gaps(pose_s: Array) -> Iterator[tuple[float, float]]:
+    """Last and next stamp of each stretch without poses [s]."""
+    steps = np.diff(pose_s)
+    for at in np.flatnonzero(steps > max(_GAP_S, 3.0 * float(np.median(steps)))):
+        yield float(pose_s[at]), float(pose_s[at + 1])
 
 
 def _smoothed(pose_s: Array, yaw_rad: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -248,11 +249,11 @@ def time_offset(
     from calibration.plots import offset_plot
     from calibration.schema import CameraCalibration, load_calibration, save_calibration
     from calibration.time_offset import fit_offset, image_turns
-    from nodes.lab.wizards.bags import CAR, IMAGES, read_frames, read_poses
+    from nodes.lab.wizards.bags import CAR, IMAGES, camera_of, read_frames, read_poses
 
     keep_inputs(output, source, camera)
     known = load_calibration(CameraCalibration, camera)
-    bag = _source(source, live, (IMAGES, CAR), output)
+    bag = _source(source, live, (IMAGES, CAR), output, {"camera.yaml": camera.read_bytes()})
     poses = read_poses(bag, CAR)
     start = int(poses.stamps_ns[0])
     turns = image_turns((((stamp - start) / 1e9, image) for stamp, image in read_frames(bag)), known)
@@ -260,17 +261,29 @@ def time_offset(
     fit = fit_offset(turns, (poses.stamps_ns - start) / 1e9, yaw)
     save_and_print(fit.calibration, output, lambda figure: offset_plot(figure, fit))
     offset = fit.calibration.camera_minus_mocap_s
-    # The camera node already subtracted its current latency_s from the stamps in the bag.
-    total = known.latency_s + offset
+    # The camera node subtracted the latency_s of then from the stamps in the bag: a second run on the same bag adds nothing.
+    recorded = camera_of(bag)
+    then_s = known.latency_s if recorded is None else recorded.latency_s
+    total = then_s + offset
     if update:
         save_calibration(known.model_copy(update={"latency_s": round(total, 6)}), camera)
     print(
-        f"camera {1000 * offset:+.1f} ms behind motion capture; latency_s {known.latency_s:g} -> {total:.4f}"
+        f"camera {1000 * offset:+.1f} ms behind motion capture as recorded with latency_s {then_s:g}; latency_s {known.latency_s:g} -> {total:.4f}"
         + (f" in {camera}" if update else "")
     )
+    if recorded is None:
+        print(
+            f"the bag has no camera.yaml; it is taken as recorded with the latency_s of {camera}. Do not update from it twice"
+        )
 
 
-def _source(source: Path | None, live: LiveOptions, topics: tuple[str, ...], output: Path) -> Path:
+def _source(
+    source: Path | None,
+    live: LiveOptions,
+    topics: tuple[str, ...],
+    output: Path,
+    attachments: Mapping[str, bytes] | None = None,
+) -> Path:
     from calibration.schema import CalibrationError
 
     if (source is None) == (live.live_s == 0.0):
@@ -284,7 +297,7 @@ def _source(source: Path | None, live: LiveOptions, topics: tuple[str, ...], out
 
     bag = output.with_name(f"{output.stem}-{time.strftime('%Y%m%d-%H%M%S')}")
     print(f"recording {', '.join(topics)} for {live.live_s:g} s into {bag}", flush=True)
-    return record_live(find_run_dir(live.run_dir), topics, live.live_s, bag)
+    return record_live(find_run_dir(live.run_dir), topics, live.live_s, bag, attachments)
 
 
 def _transform(file: Path) -> Array:

@@ -1,6 +1,5 @@
 """An offset put between camera and motion capture is measured; steady, rhythmic and missing turns are refused with the reason."""
 
-import cv2
 import numpy as np
 import pytest
 
@@ -9,6 +8,7 @@ from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.measured import TimeOffsetCalibration
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
 from calibration.time_offset import Turns, fit_offset, image_turns
+from tests.support.turning import far_wall, yaw_at
 
 CAMERA = CameraCalibration(
     date="2026-11-21",
@@ -25,11 +25,6 @@ POSE_S = np.arange(0.0, 24.0, 0.01)
 FRAME_S = np.arange(1.0, 23.0, 0.1)
 
 
-def yaw_at(t):
-    """Turned to and fro by hand: no rhythm."""
-    return 0.5 * np.sin(1.1 * t) + 0.25 * np.sin(2.63 * t + 1.0) + 0.1 * np.sin(5.1 * t)
-
-
 def turns(offset_s, rng, noise_rad=0.002, yaw=yaw_at):
     a, b = FRAME_S[:-1], FRAME_S[1:]
     return Turns(a, b, yaw(b - offset_s) - yaw(a - offset_s) + rng.normal(0.0, noise_rad, len(a)))
@@ -44,35 +39,24 @@ def test_known_offset(offset_s):
     assert fit.scale == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("offset_s", [0.06, -0.2])
+def test_a_car_that_was_hidden_for_two_seconds_costs_only_those_turns(offset_s):
+    rng = np.random.default_rng(0)
+    kept = (POSE_S < 9.0) | (POSE_S > 11.0)
+    yaw = yaw_at(POSE_S) + rng.normal(0.0, 0.001, len(POSE_S))
+    fit = fit_offset(turns(offset_s, rng), POSE_S[kept], yaw[kept])
+    assert fit.camera_minus_mocap_s == pytest.approx(offset_s, abs=0.003)
+    assert 185 < len(fit.turns.yaw_rad) < 195
+
+
 def test_pictures_of_a_far_wall_turn_as_the_camera_did():
     """A texture at infinity, warped by the known rotation: image turns against the closed form."""
-    rng = np.random.default_rng(1)
-    grey = cv2.GaussianBlur(rng.uniform(0, 255, (600, 1400)).astype(np.float32), (0, 0), 3.0)
-    grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX)
-    matrix, R_mount = CAMERA.pinhole.matrix, CAMERA.mount[:3, :3]
     times = np.arange(0.0, 2.0, 0.1)
-    frames = []
-    for t in times:
-        yaw = 0.5 * yaw_at(t)
-        c, s = np.cos(yaw), np.sin(yaw)
-        rays = (
-            CAMERA.pinhole.directions() @ (np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_mount).T
-        )
-        u = 700.0 - 400.0 * np.arctan2(rays[..., 1], rays[..., 0])
-        v = 300.0 - 400.0 * rays[..., 2] / np.hypot(rays[..., 0], rays[..., 1])
-        frames.append(
-            (
-                t,
-                cv2.remap(grey, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR).astype(
-                    np.uint8
-                ),
-            )
-        )
+    frames = list(zip(times, far_wall(CAMERA, 0.5 * yaw_at(times)), strict=True))
     found = image_turns(frames, CAMERA)
     truth = 0.5 * (yaw_at(found.end_s) - yaw_at(found.start_s))
     assert len(found.yaw_rad) >= 18
     np.testing.assert_allclose(found.yaw_rad, truth, atol=0.002)
-    assert matrix[0, 0] == 174.0
 
 
 def test_a_car_at_rest_is_refused():

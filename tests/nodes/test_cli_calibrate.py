@@ -36,6 +36,7 @@ from nodes.runtime.messages import encode, header, image_message, pose_message, 
 from tests.support.boards import BOARD
 from tests.support.drives import CAR, drive, program
 from tests.support.messages import filled
+from tests.support.turning import far_wall, yaw_at
 
 START_NS = 1_800_000_000_000_000_000
 PINHOLE = LabConfig().camera.pinhole
@@ -108,6 +109,43 @@ def test_vehicle_from_a_bag(tmp_path, capsys):
     assert run("car", "calibrate", "time-offset", bag, "--camera", camera, "-o", tmp_path / "no.yaml") == 2
     assert "expected images on /camera/image_raw or " in capsys.readouterr().err
     assert not (tmp_path / "no.yaml").exists()
+
+
+@pytest.mark.parametrize("attached", [True, False])
+def test_a_time_offset_is_added_to_the_latency_that_the_bag_was_recorded_with(tmp_path, capsys, attached):
+    """The camera is 60 ms late, and 20 ms of it were known already; a second run on the same bag changes nothing."""
+    file, times = tmp_path / "camera.yaml", np.arange(0.0, 8.0, 0.01)
+    recorded = twin_calibrations(LabConfig())["camera"].model_copy(
+        update={"latency_s": 0.02, "distortion": (0.0,) * 5}
+    )
+    save_calibration(recorded, file)
+    seen = np.arange(0.5, 7.5, 0.1)
+    with BagWriter(tmp_path / "bag", {"camera.yaml": file.read_bytes()} if attached else {}) as writer:
+        write_poses(writer, "/vicon/car", times, [planar_pose(0.0, 0.0, yaw_at(t)) for t in times])
+        for k, (t, grey) in enumerate(zip(seen, far_wall(recorded, yaw_at(seen)), strict=True)):
+            stamp = ns(t + 0.06 - 0.02)
+            image = image_message(np.repeat(grey[..., None], 3, -1), stamp, "camera")
+            writer.write("/camera/image_raw", encode(image), stamp, stamp, k)
+    command = (
+        "car",
+        "calibrate",
+        "time-offset",
+        tmp_path / "bag",
+        "--camera",
+        file,
+        "--update",
+        "-o",
+        tmp_path / "off.yaml",
+    )
+    assert run(*command) == 0
+    assert load_calibration(CameraCalibration, file).latency_s == pytest.approx(0.06, abs=0.003)
+    said = capsys.readouterr().out
+    assert "as recorded with latency_s 0.02" in said
+    assert ("Do not update from it twice" in said) == (not attached)
+    assert run(*command) == 0
+    assert load_calibration(CameraCalibration, file).latency_s == pytest.approx(
+        0.06 if attached else 0.10, abs=0.005
+    )
 
 
 def test_a_source_is_needed_and_only_one(tmp_path, capsys):

@@ -21,12 +21,12 @@ from calibration.camera_to_car import MountView
 from calibration.charuco import BoardDetector, Detection
 from calibration.degeneracy import DegenerateDataError, mean_transform
 from calibration.display_colour import mean_colour, screen_region
-from calibration.schema import CalibrationError
+from calibration.schema import CalibrationError, CameraCalibration, parse_calibration
 from calibration.vehicle import RecordedDrive
 from nodes.bags import decoded
 from nodes.bags.images import image_messages, image_topic
 from nodes.bags.parts import holds_bag
-from nodes.bags.reader import read_info
+from nodes.bags.reader import read_attachments, read_info
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import stamp_ns
 from nodes.runtime.pictures import rgb_image
@@ -59,6 +59,16 @@ class PoseSeries:
         first, last = np.searchsorted(self.stamps_ns, [stamp - half_ns, stamp + half_ns])
         middle = int(np.searchsorted(self.stamps_ns, stamp))
         return self.T[first:last] if first < middle < last and last - first >= 3 else None
+
+
+def camera_of(bag: Path) -> CameraCalibration | None:
+    """The camera file that was attached to a bag when it was recorded; None without one.
+
+    Raises:
+        CalibrationError: It is none.
+    """
+    content = read_attachments(bag).get("camera.yaml")
+    return None if content is None else parse_calibration(CameraCalibration, content, f"camera.yaml of {bag}")
 
 
 def read_poses(bag: Path, topic: str) -> PoseSeries:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from nodes.bags.writer import BagWriter
@@ -11,17 +11,24 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.errors import BagError
 
 
-def record_live(run_dir: Path, topics: Sequence[str], duration_s: float, bag: Path) -> Path:
+def record_live(
+    run_dir: Path,
+    topics: Sequence[str],
+    duration_s: float,
+    bag: Path,
+    attachments: Mapping[str, bytes] | None = None,
+) -> Path:
     """Record topics for a given time.
 
     Args:
         bag: New folder.
+        attachments: Content of files to attach by name: what the recorded numbers depend on.
 
     Raises:
         BagError: One of the topics had no messages.
     """
     heard = dict.fromkeys(topics, 0)
-    with Bus(run_dir) as bus, BagWriter(bag) as writer:
+    with Bus(run_dir) as bus, BagWriter(bag, attachments) as writer:
         for topic in topics:
             bus.subscribe(topic, queue=2000)
         end = time.monotonic() + duration_s
