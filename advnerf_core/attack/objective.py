@@ -11,7 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -291,7 +291,7 @@ def values_of(objective: Objective, drives: JudgedDrives) -> Tensor:
     Raises:
         ObjectiveError: The objective does not give one finite number for each drive.
     """
-    return _one_each(objective, "value", objective.value(drives), drives).detach().to(drives.states.dtype)
+    return _judged(objective, "value", drives).detach().to(drives.states.dtype)
 
 
 def losses_of(objective: Objective, drives: JudgedDrives) -> Tensor:
@@ -300,7 +300,7 @@ def losses_of(objective: Objective, drives: JudgedDrives) -> Tensor:
     Raises:
         ObjectiveError: The objective does not give one finite number for each drive.
     """
-    found = _one_each(objective, "loss", objective.loss(drives), drives)
+    found = _judged(objective, "loss", drives)
     # Whole numbers have no mean, and no gradient that could be looked for.
     return found if found.is_floating_point() else found.to(drives.states.dtype)
 
@@ -321,6 +321,19 @@ def loss_slopes(objective: Objective, drives: JudgedDrives) -> tuple[float, Tens
             )
         (slopes,) = torch.autograd.grad(loss, states)
     return float(loss.detach()), slopes
+
+
+def _judged(objective: Objective, what: Literal["value", "loss"], drives: JudgedDrives) -> Tensor:
+    seen = {"states": drives.states, "cte_m": drives.cte_m}
+    before = {name: each.detach().clone() for name, each in seen.items()}
+    found = _one_each(objective, what, getattr(objective, what)(drives), drives)
+    for name, each in seen.items():
+        if not torch.allclose(each.detach(), before[name], rtol=0.0, atol=0.0, equal_nan=True):
+            raise ObjectiveError(
+                f"expected {what} of {type(objective).__name__} to leave drives.{name} as it is, got other numbers in it after the call, which would be "
+                "taken for the car's drive; write x = x - y instead of x -= y, and clamp instead of clamp_"
+            )
+    return found
 
 
 def _one_each(objective: Objective, what: str, found: object, drives: JudgedDrives) -> Tensor:

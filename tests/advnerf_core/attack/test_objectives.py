@@ -265,6 +265,39 @@ def test_a_key_follows_the_code_and_not_the_folder(tmp_path):
     assert objective_key("peak") == "peak"
 
 
+class MovesStates(Objective):
+    def value(self, drives):
+        place = drives.states[1:, :, :2]
+        place -= torch.tensor([3.0, 0.0], dtype=place.dtype)
+        return -place.norm(dim=-1).sum(0)
+
+
+class MovesErrors(Objective):
+    def value(self, drives):
+        errors = drives.cte_m
+        errors -= 0.02
+        return errors.clamp_(min=0.0).sum(0)
+
+
+class MovesThroughNumpy(Objective):
+    def value(self, drives):
+        drives.states.detach().numpy()[1:, :, 0] -= 1.0
+        return drives.cte_m.abs().sum(0)
+
+
+@pytest.mark.parametrize(
+    ("objective", "name"),
+    [(MovesStates(), "states"), (MovesErrors(), "cte_m"), (MovesThroughNumpy(), "states")],
+)
+@pytest.mark.parametrize("judged", [values_of, losses_of])
+def test_an_objective_that_changes_the_drives_in_place_is_refused(objective, name, judged):
+    """The changed numbers would be the car's drive: a harmless texture had been reported 5 m off the track."""
+    with pytest.raises(
+        ObjectiveError, match=rf"{type(objective).__name__} to leave drives\.{name} as it is, .* x = x - y"
+    ):
+        judged(objective, random_drives(3))
+
+
 def test_what_breaks_the_contract_is_one_line():
     class Constant(Objective):
         def value(self, drives):
