@@ -62,8 +62,8 @@ class AdaptedPolicy(nn.Module):
             )
         return steering if self.stateless else (steering, memory)
 
-    def answers_mrad(self) -> list[int]:
-        """Steering for three fixed pictures [mrad, whole], which identifies a queried program."""
+    def answers(self, unit_rad: float = 1e-3) -> list[int]:
+        """Steering for three fixed pictures in whole units, which identifies what no weights tell."""
         generator = torch.Generator().manual_seed(0)
         pictures = torch.rand(3, 3, *self.contract.size, generator=generator)
         pictures[0] = 0.5
@@ -73,7 +73,7 @@ class AdaptedPolicy(nn.Module):
                 steering = self(pictures, goals)
             else:
                 steering, _ = self(pictures, goals, self.initial_memory(3))
-        return [round(1000.0 * float(each)) for each in steering]
+        return [round(float(each) / unit_rad) for each in steering]
 
     def described_tensors(self) -> list[tuple[str, str]]:
         """Name and use of each input and output with its shape, from the file, else from the contract."""

@@ -77,7 +77,7 @@ def check_policy(
     for name, look in _LOOKS:
         try:
             finding = look(examined, images)
-        except Exception as error:  # such as a picture that forward changes in place
+        except Exception as error:  # such as a forward that leaves torch
             finding = Finding(name, FAILURE, f"the network fails: {in_one_line(error):.160}")
         findings.append(finding)
         if finding.verdict == FAILURE and look in (_finite, _repeatable):

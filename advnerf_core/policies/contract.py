@@ -246,7 +246,9 @@ class PolicyContract:
                 f"expected images [{expected}], got {list(images.shape)}; use the policy's own view"
             )
         batch, images = len(images), images.reshape(-1, 3, *self.size)
-        images = in_colour_space(images, self.colour_space)
+        images = in_colour_space(
+            images + 0.0, self.colour_space
+        )  # a copy: a network may normalise its input in place
         if self.value_max != 1.0:
             images = images * self.value_max
         if any(self.mean):

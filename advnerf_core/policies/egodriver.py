@@ -206,9 +206,7 @@ def load_driver_at(
         PolicyContractError: No driver answers, or another than expected.
     """
     policy = driver_at(address, view, rig)
-    digest = hashlib.sha256(
-        f"{policy.identity}\0{policy.contract.to_json()}\0{policy.answers_mrad()}".encode()
-    )
+    digest = hashlib.sha256(f"{policy.identity}\0{policy.contract.to_json()}\0{policy.answers()}".encode())
     sha256 = digest.hexdigest()
     if expected_sha256 not in (None, sha256):
         raise PolicyContractError(

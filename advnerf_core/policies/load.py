@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 _FACTORY = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".pt2")
+_FUNCTION_IN_FILE = re.compile(r"(.*/)?(?P<module>[^/]*)\.py:(?P<name>.*)")
 _ADDRESS = re.compile(r"grpcs?://")
 _RUNS_CODE = (
     "such files run code when they are opened: write a .pt2 with torch.export.save or a .onnx with torch.onnx.export, "
@@ -42,12 +43,14 @@ _OTHER_FILES = {
     **dict.fromkeys((".engine", ".trt", ".plan"), "it is for one GPU: give the .onnx that it was built from"),
     ".py": "name a function in it: package.module:factory",
 }
+# Another processor's last digits are a thousandth of this.
+_ANSWER_RAD = 1e-4
 _CODE_OF_MODULES: WeakKeyDictionary[ModuleType, str] = WeakKeyDictionary()
 
 
 def is_factory(spec: str | os.PathLike[str]) -> bool:
     """Whether a policy is named as ``package.module:factory`` and not as a file."""
-    return _FACTORY.fullmatch(str(spec)) is not None
+    return _FACTORY.fullmatch(str(spec)) is not None and _FUNCTION_IN_FILE.fullmatch(str(spec)) is None
 
 
 def is_code(spec: str | os.PathLike[str]) -> bool:
@@ -65,6 +68,8 @@ def wrong_policy(spec: str | os.PathLike[str]) -> str:
     path = Path(spec)
     ending = path.suffix.lower()
     advice = f"; {_OTHER_FILES.get(ending, 'correct the name')}"
+    if in_file := _FUNCTION_IN_FILE.fullmatch(str(spec)):
+        advice = f"; write {in_file['module']}:{in_file['name']}, and start in the folder that holds the file, or put it beside the experiment file"
     if ending in POLICY_SUFFIXES:
         advice = ", which is not there" if path.suffix == ending else "; write its ending in small letters"
     return f"expected a policy file ({', '.join(POLICY_SUFFIXES)}), package.module:factory or grpc://HOST:PORT, got {spec}{advice}"
@@ -185,15 +190,29 @@ def _imported(name: str) -> tuple[ModuleType, str]:
 
 
 def _factory_sha256(spec: str, policy: AdaptedPolicy, code: str) -> str:
-    """Hash of weights, declaration and code; for a queried program also of its identity and its answers to fixed pictures."""
+    """Hash of weights, declaration, code and answers to fixed pictures; for a queried program also of its identity."""
     digest = hashlib.sha256(f"{spec}\0{policy.contract.to_json()}\0{code}".encode())
     for name, tensor in sorted(policy.state_dict().items()):
         array = tensor.detach().cpu().contiguous().numpy()
         digest.update(f"{name}\0{array.dtype.str}\0{array.shape}\0".encode())
         digest.update(array.tobytes())
     if policy.identity:
-        digest.update(f"{policy.identity}\0{policy.answers_mrad()}".encode())
+        digest.update(f"{policy.identity}\0{policy.answers()}".encode())
+    else:
+        digest.update(_answers(policy).encode())
     return digest.hexdigest()
+
+
+def _answers(policy: AdaptedPolicy) -> str:
+    """What a policy steers at fixed pictures: what it computes with files of its own is in no weights that torch knows.
+
+    Nothing of a policy that draws lots, whose hash would differ each time, or of one that fails at these pictures.
+    """
+    try:
+        first, again = (policy.answers(_ANSWER_RAD) for _ in range(2))
+    except FAILURES:
+        return ""
+    return str(first) if first == again else ""
 
 
 def source_sha256(spec: str | os.PathLike[str]) -> str:

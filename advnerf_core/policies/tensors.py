@@ -147,6 +147,11 @@ def _check_image(image: TensorInfo, contract: PolicyContract, path: Path) -> Non
         )
     if image.shape is None:
         return
+    if isinstance(batch := (image.shape or (None,))[0], int) and batch != 1:
+        raise PolicyContractError(
+            f"{path}: expected an input for any number of images, or for one, got {image}: it takes {batch} at a time; export it with a dynamic batch, or "
+            "with a batch of 1"
+        )
     expected = contract.input_shape
     fits = len(image.shape) == 1 + len(expected) and all(
         not isinstance(has, int) or has == wants for has, wants in zip(image.shape[1:], expected, strict=True)

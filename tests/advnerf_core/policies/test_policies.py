@@ -18,7 +18,7 @@ from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.exported_policy import export_program
 from advnerf_core.policies.guess import guess_contract
-from advnerf_core.policies.load import load_adapted, load_any_policy, load_driver
+from advnerf_core.policies.load import is_factory, load_adapted, load_any_policy, load_driver
 from advnerf_core.policies.onnx_policy import OnnxNetwork, export_onnx
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import save_policy
@@ -285,6 +285,16 @@ def test_files_of_other_kinds_are_told_what_makes_a_policy_of_them(tmp_path, nam
     for reads in (load_any_policy, guess_contract):
         with pytest.raises(PolicyContractError, match=told):
             reads(tmp_path / name)
+
+
+def test_a_function_in_a_file_is_told_how_modules_are_named(tmp_path):
+    for spec in ("pol.py:drive", "./sub/pol.py:drive"):
+        assert not is_factory(spec)
+        with pytest.raises(
+            PolicyContractError, match=r"got .*pol\.py:drive; write pol:drive, and start in the folder"
+        ):
+            load_any_policy(spec)
+    assert is_factory("py:drive")
 
 
 def test_our_own_file_is_one_of_them(tmp_path):

@@ -17,7 +17,16 @@ from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.load import load_any_policy, load_driver
 from advnerf_core.policies.onnx_policy import OnnxNetwork
 from advnerf_core.policies.tensors import TensorInfo, chosen_tensors
-from tests.support.onnx_models import IMAGE, VIEW, mean_model, save_beside, steering, steering_of
+from tests.support.onnx_models import (
+    IMAGE,
+    VIEW,
+    declare_beside,
+    mean_model,
+    network_model,
+    save_beside,
+    steering,
+    steering_of,
+)
 
 CASES = Path(__file__).parents[4] / "shared" / "data" / "cases"
 
@@ -226,6 +235,51 @@ def test_an_exported_program_is_asked_the_same_questions(tmp_path):
     assert not policy.differentiable
     expected = np.deg2rad(0.7 * 51.0)
     torch.testing.assert_close(policy(torch.full((2, 3, 8, 12), 0.2)), torch.full((2,), float(expected)))
+
+
+class Squeezed(torch.nn.Module):
+    def forward(self, images):
+        return (0.7 * images.mean((1, 2, 3), keepdim=True)).squeeze()
+
+
+def test_a_file_for_one_image_may_squeeze_its_answer_to_a_number(tmp_path):
+    """As many export it: the number can only be that image's."""
+    mean = ("ReduceMean", ["images"], ["steering"], {"axes": [0, 1, 2, 3], "keepdims": 0})
+    model = network_model(
+        [mean], {"images": (TensorProto.FLOAT, [1, 3, 8, 12])}, {"steering": (TensorProto.FLOAT, [])}
+    )
+    network = OnnxNetwork(save_beside(model, tmp_path / "policy.onnx"))
+    assert steering(network, 0.5, 1) == pytest.approx([0.5])
+    assert steering(network, 0.5, 3) == pytest.approx([0.5] * 3)
+    program = torch.export.export(Squeezed(), (torch.rand(1, 3, 8, 12),))
+    torch.export.save(program, tmp_path / "policy.pt2")
+    policy = load_any_policy(declare_beside(tmp_path / "policy.pt2", {})).policy
+    for count in (1, 4):
+        grey = torch.full((count, 3, 8, 12), 0.5, requires_grad=True)
+        found = policy(grey)
+        torch.testing.assert_close(found, torch.full((count,), 0.35))
+        found.sum().backward()
+        torch.testing.assert_close(grey.grad, torch.full_like(grey, 0.7 / (3 * 8 * 12)))
+
+
+def test_a_file_for_four_images_is_refused_when_it_is_loaded(tmp_path):
+    """It had worked for an attack from four starts, and failed from any other number."""
+    mean = ("ReduceMean", ["images"], ["steering"], {"axes": [1, 2, 3], "keepdims": 0})
+    model = network_model(
+        [mean], {"images": (TensorProto.FLOAT, [4, 3, 8, 12])}, {"steering": (TensorProto.FLOAT, [4])}
+    )
+    with pytest.raises(PolicyContractError, match=r"it takes 4 at a time; export it with a dynamic batch"):
+        OnnxNetwork(save_beside(model, tmp_path / "policy.onnx"))
+
+
+def test_a_network_may_normalise_its_input_in_place():
+    images = torch.full((2, 3, 8, 12), 0.75, requires_grad=True)
+    policy = adapt(lambda x: x.sub_(0.5).div_(0.5).mean((1, 2, 3)), PolicyContract(VIEW))
+    found = policy(images)
+    torch.testing.assert_close(found, torch.full((2,), 0.5))
+    assert (images == 0.75).all()
+    found.sum().backward()
+    torch.testing.assert_close(images.grad, torch.full_like(images, 2.0 / (3 * 8 * 12)))
 
 
 def test_a_network_of_several_outputs_is_asked_for_the_one_that_steers():

@@ -128,6 +128,39 @@ def test_a_module_that_was_edited_after_its_import_keeps_the_hash_of_its_code(tm
     fresh(monkeypatch)
 
 
+READS = """
+import json
+import torch
+from pathlib import Path
+GAIN = json.loads(Path(__file__).with_name("gain.json").read_text())
+def steer(images):
+    noise = {noise} * torch.rand(len(images))
+    return GAIN * (images.mean((1, 2, 3)) - 0.4) + noise
+def factory():
+    from advnerf_core import PolicyContract, PolicyView, adapt
+    from advnerf_core.geometry import Pinhole
+    view = PolicyView(Pinhole(12, 8, 6.0, 6.0, 6.0, 4.0), 0, 8, 12, 8)
+    return adapt(steer, PolicyContract(view))
+"""
+
+
+def test_of_a_factory_whose_code_reads_a_file(tmp_path, monkeypatch):
+    """No weight of it is known to torch; what it steers is."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    hashes = []
+    for gain, noise in ((0.3, 0), (0.3, 0), (-0.3, 0), (0.302, 0), (0.3, 1), (-0.3, 1)):
+        fresh(monkeypatch)
+        (tmp_path / "my_policy_reads.py").write_text(READS.format(noise=noise))
+        (tmp_path / "gain.json").write_text(str(gain))
+        hashes.append(load_any_policy("my_policy_reads:factory").sha256)
+    fresh(monkeypatch)
+    assert hashes[0] == hashes[1]
+    assert len(set(hashes[1:4])) == 3
+    assert (
+        hashes[4] == hashes[5] not in hashes[:4]
+    )  # one that draws lots answers differently each time: its answers do not count
+
+
 SERVED = """
 import socket
 import torch
