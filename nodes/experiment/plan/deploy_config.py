@@ -69,6 +69,10 @@ class DeployConfig(StrictModel):
             for what, is_wanted in wanted.items():
                 if is_wanted and self.through != way:
                     raise ValueError(f"expected deploy.through {way} with {what}, got {self.through}")
+        if self.through == "nothing" and not self.camera.ideal:
+            raise ValueError(
+                "expected deploy.through world or nodes with deploy.camera, got nothing, where no camera drives"
+            )
         return self
 
     @property

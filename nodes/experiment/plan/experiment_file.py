@@ -58,25 +58,30 @@ def read_experiment_file(file: Path, setting: str | None, overrides: Sequence[st
 
 
 def _with_setting(file: Path, setting: str | None, above: Sequence[Path]) -> ExperimentFile:
-    document, base_name = _on_its_base(file, above)
-    settings = document.data.pop("settings", None) or {}
+    """An experiment file on its base, if it has one. The base's entry of the setting is laid over the base, and the file over both."""
+    layers = _layers(file, above)
+    known = dict.fromkeys(name for layer in layers for name in layer.data.get("settings") or {})
     if setting is None:
-        setting = DEFAULT_SETTING if settings else ""
-        if settings and setting not in settings:
+        setting = DEFAULT_SETTING if known else ""
+        if known and setting not in known:
             raise ConfigError(
-                f"{file}: expected one of the settings {', '.join(settings)}, got none; give --setting, or call one {DEFAULT_SETTING}"
+                f"{file}: expected one of the settings {', '.join(known)}, got none; give --setting, or call one {DEFAULT_SETTING}"
             )
-    if setting or settings:
-        if setting not in settings:
-            raise ConfigError(
-                f"{file}: no setting called {setting!r}; known are {', '.join(settings) or 'none'}"
-            )
-        _lay_over(document, settings[setting] or {}, ("settings", setting), ())
-    return ExperimentFile(setting, document, base_name or document.data.get("name"))
+    elif setting not in known and (setting or known):
+        raise ConfigError(f"{file}: no setting called {setting!r}; known are {', '.join(known) or 'none'}")
+    names = [layer.data.get("name") for layer in layers]
+    for layer in layers:
+        chosen = (layer.data.pop("settings", None) or {}).get(setting)
+        _lay_over(layer, chosen or {}, ("settings", setting), ())
+    document = layers[0]
+    for layer in layers[1:]:
+        _lay_over(document, layer.data, (), (), layer.places)
+    of = next((name for name in reversed(names[:-1]) if name), document.data.get("name"))
+    return ExperimentFile(setting, document, of)
 
 
-def _on_its_base(file: Path, above: Sequence[Path]) -> tuple[Document, Any]:
-    """An experiment file, laid over the file that its key ``base`` names, if it has one, and the name of that experiment."""
+def _layers(file: Path, above: Sequence[Path]) -> list[Document]:
+    """An experiment file with what it builds on, the lowest first: a base with a setting of its own is one layer, with that setting."""
     document = read_yaml(file)
     if not isinstance(document.data, dict):
         raise ConfigError(f"{file}: expected an experiment file with keys and values")
@@ -87,19 +92,15 @@ def _on_its_base(file: Path, above: Sequence[Path]) -> tuple[Document, Any]:
                 f"{document.place(('setting',))}: expected setting only with base, whose setting it names, got {setting}; name the settings of "
                 "this file under settings"
             )
-        return document, None
+        return [document]
     at = file.parent / str(base)
     if at.resolve() in [each.resolve() for each in (*above, file)]:
         raise ConfigError(
             f"{document.place(('base',))}: expected a base other than the file itself, got {base}"
         )
     if setting is None:
-        under, _ = _on_its_base(at, (*above, file))
-    else:
-        under = _with_setting(at, str(setting), (*above, file)).document
-    name = under.data.get("name")
-    _lay_over(under, document.data, (), (), document.places)
-    return Document(under.data, document.source, under.places), name
+        return [*_layers(at, (*above, file)), document]
+    return [_with_setting(at, str(setting), (*above, file)).document, document]
 
 
 def _variant(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -262,7 +262,7 @@ def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
 def _horizon(experiment: Experiment, live: LiveRun) -> Horizon:
     """Control ticks over which a run is measured."""
     limits = experiment.limits
-    return limits if live.ticks is None else Horizon(live.ticks, limits.dt_s, limits.off_track_m)
+    return limits if live.ticks is None else replace(limits, ticks=live.ticks)
 
 
 def _check_drawn(live: LiveRun, drawn: list[str]) -> None:

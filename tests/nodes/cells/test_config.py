@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from nodes.cli.main import app
 from nodes.experiment.plan.cell import select
+from nodes.experiment.plan.experiment_file import read_experiment_file
 from nodes.experiment.run.run import _refuse_two_in_one_folder
 from nodes.experiment.show.given import given_in
 from nodes.experiment.steps.run import load_experiment
@@ -43,6 +44,29 @@ def file(tmp_path):
 
 def load(file, *overrides, folder=None):
     return load_experiment(file, None, list(overrides), folder)
+
+
+def test_what_a_file_says_goes_before_every_setting_of_its_base(tmp_path):
+    """A base's own entry of a setting is laid over the base; the file's values over both, and its own entry over these."""
+    (tmp_path / "base.experiment.yaml").write_text(
+        "name: base\nattack: {evaluations: 1, starts: 1}\nsettings:\n  demo: {attack: {evaluations: 2, starts: 2}, held_cap_m: 2}\n  full: {}\n"
+    )
+    mine = tmp_path / "mine.experiment.yaml"
+    mine.write_text(
+        "base: base.experiment.yaml\nname: mine\nattack: {evaluations: 50}\nsettings:\n  full: {attack: {starts: 5}}\n"
+    )
+    third = tmp_path / "third.experiment.yaml"
+    third.write_text("base: mine.experiment.yaml\nheld_cap_m: 3\n")
+    read = {
+        (file, setting): read_experiment_file(file, setting, []).document.data
+        for file in (mine, third)
+        for setting in (None, "full")
+    }
+    assert read[mine, None] == {"name": "mine", "attack": {"evaluations": 50, "starts": 2}, "held_cap_m": 2}
+    assert read[mine, "full"] == {"name": "mine", "attack": {"evaluations": 50, "starts": 5}}
+    assert read[third, None] == read[mine, None] | {"held_cap_m": 3}
+    assert read[third, "full"] == read[mine, "full"] | {"held_cap_m": 3}
+    assert read_experiment_file(third, None, []).of == "mine"
 
 
 def test_an_experiment_is_the_product_of_what_it_goes_over(file):

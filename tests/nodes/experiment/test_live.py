@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -76,11 +76,19 @@ def test_live_nodes_take_measured_calibrations_and_changes_of_the_launch_file(tm
         ([THROUGH_NODES, 'deploy.changes=["twn.vicon.noise_m=0.001"]'], "no node called 'twn'; known are"),
         ([THROUGH_NODES, 'deploy.changes=["params.policy=mine.onnx"]'], "what the experiment itself does not set"),
         (['deploy.through=world', 'deploy.changes=["twin.vicon.noise_m=0.001"]'], r"expected deploy\.through nodes with deploy\.changes"),
+        (["deploy.through=nothing", "deploy.camera=webcam"], r"expected deploy\.through world or nodes with deploy\.camera"),
     ],
 )  # fmt: skip
 def test_a_wrong_change_of_the_graph_is_one_error_before_anything_is_made(tmp_path, overrides, message):
     with pytest.raises(ConfigError, match=message):
         room(tmp_path, *overrides)
+
+
+def test_laps_are_measured_with_the_limits_of_the_experiment(tmp_path):
+    experiment = room(tmp_path, "held_cap_m=4", "horizon=40")
+    laps = live._horizon(experiment, live.LiveRun("laps", "hardened", "track", (0.0, 0.0, 0.0), ticks=400))
+    assert laps == replace(experiment.limits, ticks=400)
+    assert laps.held_cap_m == 4.0
 
 
 def test_lost_frames_are_driven_where_the_motor_node_bears_them(tmp_path):

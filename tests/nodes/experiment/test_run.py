@@ -99,7 +99,7 @@ def test_a_file_says_only_what_is_other_than_its_base(tmp_path):
         "monitor",
         3,
     )
-    assert mine.config.seeds == (0,)  # the setting's of the base, which lies over the values of both
+    assert mine.config.seeds == (4, 5)  # the file's, which lie over the base and the base's setting
     assert (mine.config.carrier.resolution, mine.config.policy) == (32, base.config.policy)
     assert load_experiment(file, "quick", [], tmp_path).config.seeds == (4, 5)
     file.write_text(file.read_text() + "view:\n  crop_topp: 3\n")
