@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.documents import read_json
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.report import data as rd
 from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import EMPTY
@@ -29,6 +31,7 @@ from nodes.experiment.steps.live import extra_runs, lab_of
 from nodes.experiment.steps.search_files import ATTACK, SEARCHED
 from nodes.experiment.steps.steering_gate import steering_of_victims
 from nodes.lab.trials import evaluation
+from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.machine import memory_gib, processor_name
 
 _PATH_POINTS = 400
@@ -87,11 +90,26 @@ def _drives(
     return rd.Drives(scenario, scene, experiment.config.dt_s, tuple(runs), tuple(curves), film, seen)
 
 
+@contextmanager
+def _of_finished(experiment: Experiment, cell: Cell) -> Iterator[None]:
+    """Say of a file that a finished cell lost how its cell is run again: its result alone keeps it from that."""
+    try:
+        yield
+    except (AdvnerfError, OSError) as error:
+        result = experiment.cell_result(cell)
+        raise RuntimeFault(
+            f"{error}; cell {cell.name} is finished, but a file of it is gone or damaged: delete {result} and the folder {result.with_suffix('')}, and "
+            "run the experiment again"
+        ) from error
+
+
 def _curves(experiment: Experiment, cell: Cell) -> Iterator[rd.LossCurve]:
     """The curve of a search over the drive without an attack from the same starts, which its attack file holds; none of older files."""
-    clean = load_attack(experiment.cell_folder(cell) / ATTACK).clean_drive
+    with _of_finished(experiment, cell):
+        clean = load_attack(experiment.cell_folder(cell) / ATTACK).clean_drive
+        found = read_json(driven_folder(experiment, cell) / SEARCHED)
     if clean is not None:
-        totals_m = np.array(read_json(driven_folder(experiment, cell) / SEARCHED)["curve_total_cte_m"])
+        totals_m = np.array(found["curve_total_cte_m"])
         excess_m = (totals_m - clean.mean_total_cte_m) / clean.ticks
         yield rd.LossCurve(cell.method, excess_m, cell.victim)
 
@@ -100,7 +118,8 @@ def _runs(experiment: Experiment, cell: Cell, domain: Domain) -> Iterator[rd.Run
     file = driven_folder(experiment, cell) / (SEARCHED if domain == "surrogate" else DRIVES)
     if domain == "deployed" and read_cell(experiment.cell_result(cell)).deployed is None:
         return  # also if a live arm was driven but the one to compare with was not
-    found = read_json(file)
+    with _of_finished(experiment, cell):
+        found = read_json(file)
     notes = [_note(each) for each in found.get("live", ())] or [""] * len(found["states"])
     for start, (states, note) in enumerate(zip(found["states"], notes, strict=True)):
         poses = np.array(states)[:, :3]
@@ -218,13 +237,15 @@ def _live_results(experiment: Experiment, cell: Cell) -> list[dict[str, Any]]:
     file = driven_folder(experiment, cell) / DRIVES
     if read_cell(experiment.cell_result(cell)).not_driven_live:
         return []  # an arm was driven, but the one to compare with was not
-    found: list[dict[str, Any]] = read_json(file)["live"]
+    with _of_finished(experiment, cell):
+        found: list[dict[str, Any]] = read_json(file)["live"]
     return found
 
 
 def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
     for cell in filter(lambda each: each.searched, experiment.cells):
-        attack = load_attack(experiment.cell_folder(cell) / ATTACK)
+        with _of_finished(experiment, cell):
+            attack = load_attack(experiment.cell_folder(cell) / ATTACK)
         whose = "" if cell.victim == experiment.config.main_victim else f", {cell.victim} victim"
         yield rd.Texture(
             f"{cell.method}, seed {cell.seed}{whose}",

@@ -78,7 +78,7 @@ def run_experiment(
         ended = run_cells(experiment, chosen, options, say, console, record)
         _write_report(experiment, console, record)
     console.print(
-        f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s",
+        f"{experiment.config.name}{experiment.setting and f' ({experiment.setting})'}: {time.monotonic() - began:.0f} s",
         highlight=False,
         markup=False,
     )
@@ -119,6 +119,8 @@ def _write_report(experiment: Experiment, console: Console, record: ProgressReco
     lacking = ""
     if NONE not in reported.config.over.method:
         lacking = "no report: it compares with drives without attack, and over.method has no none; add it"
+    elif not experiment.config.methods:
+        lacking = "no report: over.method has no attack that could be compared; add one"
     elif missing or not reported.config.methods:
         lacking = f"no report yet: {len(found) - len(done)} of {len(found)} cells are missing"
     for text in [lacking] if lacking else notes:

@@ -132,7 +132,7 @@ def surrogate_part(
         Attack id (None without an attack), states and metrics of the drives, the curve of the search [m], and its seconds.
     """
     kept = folder / SEARCHED
-    if kept.exists():
+    if kept.exists() and (not cell.searched or (folder / ATTACK).exists()):
         found: dict[str, Any] = read_json(kept)
         return found
     prepared = Prepared.of(experiment, space, cell)

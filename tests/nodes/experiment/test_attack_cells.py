@@ -98,6 +98,10 @@ def test_search_is_kept_and_its_file_brings_the_colours_back(fresh: Experiment, 
     # It is measured from a start that it was not searched from.
     assert found["states"][0][0] == pytest.approx(fresh.measured_starts(cell.scenario)[0].tolist())
     assert found["states"][0][0] != problem.start_states[0].tolist()
+    # Drives whose attack is gone are no search.
+    (folder / attack.ATTACK).unlink()
+    assert surrogate_part(fresh, space, cell, folder, silent)["attack_id"] == found["attack_id"]
+    assert load_attack(folder / attack.ATTACK).attack_id == file.attack_id
     assert theta.shape == space.sensor.theta_shape
     assert [thing.name for thing in file.objects] == [thing.name for thing in fresh.objects]
     assert file.attack_id == found["attack_id"]
