@@ -66,10 +66,11 @@ def anytime_test(a: ArrayLike, b: ArrayLike, alpha: float = 0.05) -> AnytimeTest
 def e_value(a: ArrayLike, b: ArrayLike) -> Floats:
     """e-values ``[...]`` of searches ``[..., n]`` of method a and ``[..., m]`` of method b; large ones are evidence that a is larger.
 
-    A value of a that ties with one of b counts as the smaller one.
+    A value of a that ties with one of b, but for rounding, counts as the smaller one.
     """
     ours, theirs = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    values = np.concatenate([ours, theirs], axis=-1)
+    rounding = 1e-12 * np.abs(np.concatenate([ours, theirs], axis=-1)).max(axis=-1, keepdims=True)
+    values = np.concatenate([ours - rounding, theirs], axis=-1)
     is_ours = np.arange(values.shape[-1]) < ours.shape[-1]
     # Ascending; a stable sort keeps ours, which come first, below equal ones of theirs.
     ordered = is_ours[np.argsort(values, axis=-1, kind="stable")]

@@ -73,10 +73,12 @@ def permutation_test(a: ArrayLike, b: ArrayLike) -> PermutationTest:
             f"{theirs.size}; register fewer searches"
         )
     pooled = np.concatenate([ours, theirs])
+    # Sums that differ by rounding, which grows with the values and not with what is left of them about their mean.
+    rounding = 1e-12 * np.abs(pooled).sum()
     pooled -= pooled.mean()
-    # The difference of means grows with the sum of a. Sums that differ by rounding are ties and count against a.
+    # The difference of means grows with the sum of a. Ties count against a.
     sums = pooled[_splits(ours.size, pooled.size)].sum(axis=1)
-    observed = pooled[: ours.size].sum() - 1e-12 * np.abs(pooled).sum()
+    observed = pooled[: ours.size].sum() - rounding
     return PermutationTest(np.count_nonzero(sums >= observed) / splits, difference)
 
 

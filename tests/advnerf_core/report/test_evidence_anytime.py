@@ -56,6 +56,11 @@ def test_separated_methods_are_told_apart_by_four_pairs_and_never_by_three():
     assert anytime_test(theirs, ours).p == 1.0
 
 
+def test_values_that_differ_by_rounding_tie():
+    assert anytime_test([0.1 + 0.2] * 6, [0.3] * 6) == anytime_test([0.3] * 6, [0.3] * 6)
+    assert anytime_test([0.3 + 1e-9] * 6, [0.3] * 6).pairs == 4
+
+
 def test_ties_count_against_the_method():
     assert float(e_value([1.0, 2.0], [1.0, 0.0])) == float(e_value([1.0, 2.0], [1.5, 0.0]))
     assert anytime_test(np.zeros(8), np.zeros(8)).p == 1.0

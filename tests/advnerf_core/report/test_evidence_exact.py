@@ -38,6 +38,17 @@ def test_six_that_are_all_better_than_six_reach_one_in_924():
     assert permutation_test(WORSE, BETTER).p == 1.0
 
 
+def test_means_that_differ_by_rounding_are_equal():
+    """As those of the same drives in another order, where all cars are held at the cap."""
+    drives = np.round(np.random.default_rng(0).normal(0.3, 0.1, 20), 3)
+    orders = np.random.default_rng(1).permuted(np.tile(drives, (40, 1)), axis=1)
+    means = np.array([float(np.cumsum(each)[-1]) / 20 for each in orders])
+    assert len(set(means)) > 1
+    high, low = np.sort(means)[-6:], np.sort(means)[:6]
+    assert permutation_test(high, low).p == 1.0
+    assert permutation_test([0.1 + 0.2] * 6, [0.3] * 6).p == 1.0
+
+
 def test_ties_count_against_a():
     assert permutation_test([0.1] * 6, [0.1] * 6).p == 1.0
     # a holds the one large value in half of all splits.
