@@ -25,7 +25,10 @@ _STRAIGHT_1PM = 0.1  # a radius over 10 m is a line
 _CUT_PRICE_RAD2 = 0.02
 _SHORTEST_PIECE_M = 0.20
 _MEAN_PIECE_M = 0.5  # shorter pieces on average mean noise, not a track
-_LEAST_LENGTH_M = 1.0
+_LEAST_LENGTH_M, _MOST_LENGTH_M = 1.0, 500.0
+_MOST_PIECES = 80  # more take hours to fit, and no track of tape has them
+# No pose in between: a car at 2 m/s is measured every 0.2 m at 10 Hz.
+_MOST_JUMP_M = 0.5
 _CLOSING_WEIGHT = 100.0
 _POINTS = 600
 # Distance from its start at which a loop counts as closed [m].
@@ -82,7 +85,8 @@ def fit_path(trace: ArrayLike, closed: bool | None = None) -> PathFit:
         )
     first_lap = points[: lap_ends[0] + 1] if closed else points
     start, pieces = _pieces(first_lap, closed)
-    if (length_m := sum(length for length, _ in pieces)) < _MEAN_PIECE_M * (len(pieces) - 2):
+    length_m = sum(length for length, _ in pieces)
+    if length_m < _MEAN_PIECE_M * (len(pieces) - 2) or len(pieces) > _MOST_PIECES:
         raise DegenerateDataError(
             f"this trace needs {len(pieces)} lines and arcs on {length_m:.1f} m: drive or draw it smoothly along the tape, at "
             "walking pace, in one direction"
@@ -103,6 +107,7 @@ def _thinned(xy: Array) -> Array:
     """Points ``[N, 2]`` every few centimetres along the trace; jitter on the spot adds no length."""
     if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < 2 or not np.isfinite(xy).all():
         raise DegenerateDataError(f"expected a trace of finite positions [N, 2], got shape {list(xy.shape)}")
+    _require_a_way(np.linalg.norm(np.diff(xy, axis=0), axis=1))
     kept = [xy[0]]
     for point in xy[1:]:
         gap = float(np.linalg.norm(point - kept[-1]))
@@ -115,6 +120,19 @@ def _thinned(xy: Array) -> Array:
             f"expected a trace of at least {_LEAST_LENGTH_M:g} m, got {len(points) * _STEP_M:.2f} m: did the subject move?"
         )
     return points
+
+
+def _require_a_way(steps_m: Array) -> None:
+    """Raise for jumps between neighbouring positions [m], and for a length that no track has."""
+    if (jumps := steps_m[steps_m > _MOST_JUMP_M]).size:
+        raise DegenerateDataError(
+            f"expected neighbouring positions within {_MOST_JUMP_M:g} m, got {jumps.size} jumps of up to {jumps.max():.2f} m: was the subject hidden, or "
+            "mistaken for another? Drive or draw the path again where all cameras see it, with positions in m"
+        )
+    if (length_m := float(steps_m.sum())) > _MOST_LENGTH_M:
+        raise DegenerateDataError(
+            f"expected a trace of at most {_MOST_LENGTH_M:g} m, got {length_m:.4g} m: are its positions in m? Drive a loop once or twice"
+        )
 
 
 def _returns(points: Array, closing_m: float) -> list[int]:

@@ -22,6 +22,10 @@ _LARGEST_ROOM_M = 50.0
 _SIMPLIFY_M = 0.03
 _STILL_M = 0.004
 _STILL_S = 0.8
+# Greatest cosine with the vertical of an upright face's normal, and the least of its upward side.
+_UPRIGHT = 0.5
+# A wand that is on the average farther behind the face than this part of its height was not held from the front.
+_BEHIND = 0.05
 _RECTANGLE_M = 0.01
 CORNERS = ("top left", "top right", "bottom right", "bottom left")
 
@@ -124,10 +128,14 @@ class Touches:
     Attributes:
         points_in_subject_m: ``[K, 3]`` in the order of time [m].
         spread_m: Standard deviation of each ``[K]`` [m].
+        on_the_way_m: Mean position of the tip on its ways between them ``[3]`` [m]: in front of a face that a person touches.
+        up: The world's vertical in the subject's frame ``[3]``.
     """
 
     points_in_subject_m: Array
     spread_m: Array
+    on_the_way_m: Array
+    up: Array
 
 
 def find_touches(
@@ -153,6 +161,7 @@ def find_touches(
     )
     seconds = (stamps_ns - stamps_ns[0]) / 1e9
     points, spreads, begin = [], [], 0
+    moving = np.ones(len(tips), np.bool_)
     for index in range(1, len(tips) + 1):
         moved = (
             index == len(tips)
@@ -164,8 +173,11 @@ def find_touches(
             rest = tips[begin:index]
             points.append(rest.mean(axis=0))
             spreads.append(float(rest.std(axis=0).max()))
+            moving[begin:index] = False
         begin = index
-    return Touches(np.array(points).reshape(-1, 3), np.array(spreads))
+    way = tips[moving].mean(axis=0) if moving.any() else np.full(3, np.nan)
+    up = T_world_from_subject[:, 2, :3].mean(axis=0)
+    return Touches(np.array(points).reshape(-1, 3), np.array(spreads), way, np.asarray(up))
 
 
 def target_of_touches(subject: str, touches: Touches) -> TargetCalibration:
@@ -174,7 +186,7 @@ def target_of_touches(subject: str, touches: Touches) -> TargetCalibration:
     The corners become the nearest rectangle; their distance from it is recorded.
 
     Raises:
-        DegenerateDataError: Not four touches, or no rectangle in that order.
+        DegenerateDataError: Not four touches, no rectangle in that order, or the order of an upright face's other corner or of its back.
     """
     points = touches.points_in_subject_m
     if len(points) != 4:
@@ -201,11 +213,25 @@ def target_of_touches(subject: str, touches: Touches) -> TargetCalibration:
             f"expected four corners of a rectangle, the {worst} one is {1000 * off.max():.0f} mm off: touch them again in the order "
             f"{', '.join(CORNERS)}, as seen from the front"
         )
+    _require_order(touches, middle, right, down, height)
     residuals = {
         "rectangle_mm": round(1000.0 * float(off.max()), 3),
         "rest_mm": round(1000.0 * float(touches.spread_m.max()), 3),
     }
     return _target(subject, corners, "touched with a wand", 4, residuals)
+
+
+def _require_order(touches: Touches, middle: Array, right: Array, down: Array, height_m: float) -> None:
+    """Raise for an order of corners by which the face would be upside down, on its side, or seen from its back."""
+    outward = np.cross(down, right)
+    upright = abs(float(outward @ touches.up)) < _UPRIGHT
+    fallen = upright and -float(down @ touches.up) < _UPRIGHT
+    behind = float((touches.on_the_way_m - middle) @ outward) < -_BEHIND * height_m
+    if fallen or behind:
+        got = "its top beside or below its bottom" if fallen else "a wand that came from behind it"
+        raise DegenerateDataError(
+            f"expected the corners in the order {', '.join(CORNERS)}, as seen from the front, got {got}; touch them again in that order"
+        )
 
 
 def _target(

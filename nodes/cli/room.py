@@ -26,6 +26,7 @@ BagFile = Annotated[Path, typer.Argument(help="Bag with the trace.", exists=True
 Topic = Annotated[str, typer.Option("--topic", help="Topic of the trace: /vicon/car or /vicon/wand.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")]
 _ORIGIN = "0,0,0"
+_OFF_TRACK_M, _FENCE_MARGIN_M = 0.4, 0.8
 
 
 @app.command("path")
@@ -41,14 +42,21 @@ def room_path(
         float, typer.Option("--before", help="Distance of the start pose before that corner [m].")
     ] = 2.0,
     off_track_m: Annotated[
-        float, typer.Option("--off-track", help="Absolute CTE beyond which the car is off track [m].")
-    ] = 0.4,
-    fence_margin_m: Annotated[
-        float,
+        float | None,
         typer.Option(
-            "--fence-margin", help="For a new file: distance of the provisional fence from the path [m]."
+            "--off-track",
+            help="Absolute CTE beyond which the car is off track [m].",
+            show_default="of an existing file, else 0.4",
         ),
-    ] = 0.8,
+    ] = None,
+    fence_margin_m: Annotated[
+        float | None,
+        typer.Option(
+            "--fence-margin",
+            help="Distance of a provisional fence from the path [m]; it replaces the fence of an existing file.",
+            show_default="the fence of an existing file, else 0.8",
+        ),
+    ] = None,
 ) -> None:
     """Fit the reference path to a trace of the car or the wand. The fence of an existing file is kept."""
     from calibration.path_fit import fit_path
@@ -59,14 +67,20 @@ def room_path(
     trace = _trace(bag, topic)
     fit = fit_path(trace, closed)
     old = _old_room(output)
-    fence = old.fence_m if old else fence_around(fit.path, fence_margin_m)
+    if old is not None and fence_margin_m is None:
+        fence, provisional = old.fence_m, False
+    else:
+        margin_m = _FENCE_MARGIN_M if fence_margin_m is None else fence_margin_m
+        fence, provisional = fence_around(fit.path, margin_m), True
+    if off_track_m is None:
+        off_track_m = old.off_track_m if old else _OFF_TRACK_M
     _require_clearance(clearance(fit.path, fence))
     room = measured(
         RoomCalibration,
         date=date.today(),
         method=f"path fitted to {topic}",
         path=fit.path.to_dict(),
-        off_track_m=old.off_track_m if old else off_track_m,
+        off_track_m=off_track_m,
         fence_m=fence,
         start_pose=start_before_corner(fit.path, corner, before_m),
         residuals={"path_rms_mm": round(1e3 * fit.rms_m, 2), "path_worst_mm": round(1e3 * fit.worst_m, 2)},
@@ -77,7 +91,7 @@ def room_path(
     print(f"start {before_m:g} m before corner {corner}: {room.start_pose}")
     print(
         f"{output} and {picture}"
-        + ("" if old else "; the fence is provisional, measure it with advnerf scene room fence")
+        + ("; the fence is provisional, measure it with advnerf scene room fence" if provisional else "")
     )
 
 

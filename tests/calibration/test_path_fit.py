@@ -86,3 +86,19 @@ def test_traces_that_are_none_are_refused_with_the_reason(monkeypatch):
     monkeypatch.setattr(path_fit, "_WORST_RMS_M", 0.0005)
     with pytest.raises(DegenerateDataError, match="lines and arcs leave"):
         fit_path(wavy)
+
+
+def test_jumps_and_lengths_that_no_track_has_are_refused_at_once():
+    """Ten of 670 positions off by a metre had kept the fit busy for minutes."""
+    trace = SQUARE.pose_at(np.arange(0.0, SQUARE.length_m, 0.02))[:, :2]
+    hidden = trace.copy()
+    hidden[50::60] += [1.0, 0.0]
+    with pytest.raises(
+        DegenerateDataError, match=r"within 0\.5 m, got \d+ jumps of up to 1\.0\d m: was the subject hidden"
+    ):
+        fit_path(hidden)
+    with pytest.raises(DegenerateDataError, match=r"at most 500 m, got 1\d\d\d m: are its positions in m"):
+        fit_path(10.0 * SQUARE.pose_at(np.arange(0.0, 10.0 * SQUARE.length_m, 0.02))[:, :2])
+    wild = np.random.default_rng(0).uniform(-1.0, 1.0, (4000, 2)).cumsum(axis=0) * 0.1
+    with pytest.raises(DegenerateDataError, match=r"this trace needs \d+ lines and arcs"):
+        fit_path(wild, closed=False)

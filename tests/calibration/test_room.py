@@ -141,6 +141,22 @@ def test_wrong_touches_are_refused_with_what_to_do():
         target_of_touches("monitor", touch((0, 2, 1, 3)))
 
 
+@pytest.mark.parametrize(
+    ("order", "got"),
+    [
+        ((1, 0, 3, 2), "a wand that came from behind it"),  # mirrored
+        ((1, 2, 3, 0), "its top beside or below its bottom"),
+        ((2, 3, 0, 1), "its top beside or below its bottom"),
+        ((3, 2, 1, 0), "its top beside or below its bottom"),  # upside down, and mirrored
+        ((0, 3, 2, 1), "its top beside or below its bottom"),
+    ],
+)
+def test_corners_in_another_order_are_refused(order, got):
+    """Each is a rectangle; the attack would be shown mirrored or turned."""
+    with pytest.raises(DegenerateDataError, match=f"top left, .* as seen from the front, got {got}"):
+        target_of_touches("monitor", touch(order))
+
+
 def attack(T, size=1.0, subject="board"):
     theta = np.zeros((4, 4, 3), np.float32)
     return face_attack(

@@ -78,6 +78,23 @@ def test_path_and_fence_make_a_room_file_that_the_stack_reads(tmp_path):
     assert load_calibration(RoomCalibration, tmp_path / "room.yaml") == fenced
 
 
+def test_options_go_before_an_existing_room_file_and_what_is_not_given_is_kept(tmp_path, monkeypatch):
+    poses = SQUARE.pose_at(np.arange(0.0, 1.05 * SQUARE.length_m, 0.02))
+    bag, file = write_trace(tmp_path / "lap", "/vicon/car", poses), tmp_path / "room.yaml"
+
+    def made(*options):
+        assert (
+            command(monkeypatch, "scene", "room", "path", bag, "-o", file, "--before", "1.5", *options) == 0
+        )
+        room = load_calibration(RoomCalibration, file)
+        return room.off_track_m, float(np.abs(np.array(room.fence_m)).max())
+
+    assert made() == (0.4, pytest.approx(2.8, abs=0.05))
+    assert made("--off-track", "0.15") == (0.15, pytest.approx(2.8, abs=0.05))
+    assert made("--fence-margin", "1.5") == (0.15, pytest.approx(3.5, abs=0.05))
+    assert made() == (0.15, pytest.approx(3.5, abs=0.05))
+
+
 FACE = target_of_size("board", (1.0, 1.0), (0.0, 0.0, 0.0), 0.0, "ruler")
 T_FACE = make_transform(rotation_z(np.deg2rad(188.0)), [3.04, -1.80, 0.52])
 REQUEST = {
