@@ -62,6 +62,14 @@ def test_falloff_is_learned_from_several_angles():
     assert fit.rmse(held_out=True) < 0.01
 
 
+@pytest.mark.parametrize("angle", [45.0, -0.5, 0.0, np.nan])
+def test_an_angle_that_is_no_cosine_is_refused(angle):
+    shown = np.concatenate([SHOWN, SHOWN])
+    seen = noisy(monitor(shown), np.random.default_rng(3))
+    with pytest.raises(DegenerateDataError, match=r"cos_angle above 0 and up to 1, .* write its cosine"):
+        fit_display(shown, seen, np.concatenate([np.ones(len(SHOWN)), np.full(len(SHOWN), angle)]))
+
+
 def test_saturated_sets_are_refused():
     with pytest.raises(
         DegenerateDataError, match=r"without a saturated channel, got \d+ %: shorten the exposure"
