@@ -48,6 +48,7 @@ FAULT_NAMES = {
     26: "encoder magnet too strong", 27: "phase filter", 28: "encoder", 29: "low-voltage output", 30: "encoder slipped",
     31: "over speed", 32: "under speed", 33: "over the absolute speed limit",
 }  # fmt: skip
+OVER_CURRENT = 4  # FAULT_CODE_ABS_OVER_CURRENT of the firmware
 
 
 @dataclass(frozen=True)

@@ -157,10 +157,15 @@ class Gamepad:
         return low, high
 
     def _ask(self) -> None:
-        """Buttons that are held now, read from the kernel: events do not show earlier presses, or lost events."""
-        keys = bytearray(_KEY_BYTES)
+        """Buttons that are held now, read from the kernel: events do not show earlier presses, or lost events.
+
+        A stop that was pressed in between counts as pressed now.
+        """
+        keys, before, stop = bytearray(_KEY_BYTES), self._state.held, self._layout.stop
         self._ioctl(self._fd, _EVIOCGKEY, keys)
-        self._state.held = {code for code in range(8 * _KEY_BYTES) if keys[code // 8] >> (code % 8) & 1}
+        held = {code for code in range(8 * _KEY_BYTES) if keys[code // 8] >> (code % 8) & 1}
+        self._state.stops += stop in held and stop not in before
+        self._state.held = held
         for axis in self._ranges:
             buffer = bytearray(_ABSINFO.size)
             self._ioctl(self._fd, _evioc_gabs(axis), buffer)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import select
 import termios
 import tty
@@ -19,6 +20,9 @@ from hardware.operator.hands import Hands
 
 _DRIVE = {"w": (1.0, 0.0), "a": (1.0, 1.0), "d": (1.0, -1.0), "s": (-1.0, 0.0)}
 _AUTONOMY, _STOP, _REARM = "o", " ", "r"
+# What a terminal sends for an arrow, a function key or Alt with a letter (ECMA-48, section 5.4); its last letter is no key that was pressed.
+_ESCAPE = re.compile(r"\x1b(\[[0-?]*[ -/]*[@-~]?|O[^\x1b]?|[^\[O\x1b])?")
+_BEGUN = re.compile(r"\x1b(\[[0-?]*[ -/]*|O)?$")
 # A repeat that comes later than this after the last one does not count.
 _LATE_NS = 150_000_000
 HELP = "hold w a d s: drive, hold o: let the software drive, space: e-stop, r: re-arm, Ctrl-C: end"
@@ -38,6 +42,7 @@ class Keyboard:
         self._key, self._repeats, self._key_ns = "", 0, 0
         self._stops = self._rearms = 0
         self._lost = False
+        self._rest = ""
 
     def read(self, timeout_s: float = 0.05) -> Hands:
         """Wait for keys for at most a timeout [s], and return the input."""
@@ -67,17 +72,20 @@ class Keyboard:
 
     def _take(self) -> None:
         try:
-            keys = os.read(self._fd, 256).decode("ascii", "replace").lower()
+            got = os.read(self._fd, 256).decode("ascii", "replace")
         except OSError:
-            keys = ""
-        self._lost = not keys
-        now_ns = self._mono_ns()
-        for key in keys:
-            self._stops += key == _STOP
-            self._rearms += key == _REARM
-        if not keys:
+            got = ""
+        self._lost = not got
+        if not got:
             return
+        now_ns = self._mono_ns()
+        self._stops += got.count(_STOP)  # also one after the Esc key, with which it looks like Alt and space
+        keys = self._rest + got
+        begun = _BEGUN.search(keys)
+        keys, self._rest = (keys, "") if begun is None else (keys[: begun.start()], begun[0])
+        keys = _ESCAPE.sub("", keys).lower()
+        self._rearms += keys.count(_REARM)
         # A burst after a pause shows pressed keys, not a held one: it counts as one.
-        key = keys[-1]
-        again = key == self._key and now_ns - self._key_ns <= _LATE_NS
+        key = keys[-1:]
+        again = bool(key) and key == self._key and now_ns - self._key_ns <= _LATE_NS
         self._key, self._repeats, self._key_ns = key, self._repeats + 1 if again else 0, now_ns

@@ -18,6 +18,10 @@ _SETTLE_S = 0.5
 _LEFT, _RIGHT = 0, 1
 
 
+# Noise of a standing car's poses, at 100 Hz, must not add up to a distance [m].
+_STEP_M = 0.03
+
+
 @dataclass(frozen=True)
 class CheckSettings:
     """Settings of the check.
@@ -95,10 +99,14 @@ class SteeringCheck:
         """Note a pose of the car. Poses that are not finite are ignored."""
         if not (self.showing and all(map(math.isfinite, (x_m, y_m, yaw_rad)))):
             return
-        side, last, self._last = self._side(mono_ns), self._last, (x_m, y_m, yaw_rad)
+        side, last, now = self._side(mono_ns), self._last, (x_m, y_m, yaw_rad)
         if side is None or last is None or not self._settled(mono_ns):
+            self._last = now
             return
         dx, dy = x_m - last[0], y_m - last[1]
+        if math.hypot(dx, dy) < _STEP_M:
+            return
+        self._last = now
         middle = last[2] + 0.5 * math.remainder(yaw_rad - last[2], 2.0 * math.pi)
         forward = dx * math.cos(middle) + dy * math.sin(middle)
         arc = self._arcs[side]

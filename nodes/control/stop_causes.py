@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import re
 
+from hardware.motor.vesc_replies import FAULT_NAMES, OVER_CURRENT
+
 # The texts of `arming`, `arming_gates`, `stall_check` and the safety node. A car that does not move, or whose motor draws too much
 # current, has run into something. A command out of range is the policy's answer to an image.
 _RESULT = re.compile(
     r"the car is outside the fence|the car is [\d.]+ m from the fence|stalled for |"
     r"a command of |a command that is not finite|"
-    r"node motor is in state fault: latched: the VESC reports a fault: ABS_OVER_CURRENT|"
+    rf"node motor is in state fault: latched: the VESC reports a fault: {FAULT_NAMES[OVER_CURRENT]}|"
     r"disarmed by |e-stop pressed|the e-stop is pressed|the button is not held"
 )
 _STALLED = "stalled for "

@@ -81,6 +81,17 @@ def test_a_release_among_dropped_events_is_asked_for(device):
     assert device.send((SYN, 3, 0)).human
 
 
+def test_a_stop_among_dropped_events_is_a_stop(device):
+    device.send((KEY, 0x137, 1))
+    device.keys = {0x137, 0x131}
+    assert device.send((SYN, 3, 0)).stops == 1
+    assert device.send((SYN, 3, 0)).stops == 1
+    device.keys = {0x137}
+    assert device.send((SYN, 3, 0)).stops == 1
+    device.keys = {0x137, 0x131}
+    assert device.send((SYN, 3, 0)).stops == 2
+
+
 def test_events_cut_in_two_are_put_together(device):
     whole = struct.pack("llHHi", 1, 2, KEY, 0x137, 1)
     os.write(device.fd, whole[:10])
@@ -172,6 +183,44 @@ def test_another_key_must_be_held_itself(terminal):
 def test_keys_pasted_at_once_hold_nothing(terminal):
     hands = terminal.type("wwwwwwwwwwww wr")
     assert (hands.human, hands.stops, hands.rearms) == (False, 1, 1)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"\x1b[D",
+        b"\x1b[A",
+        b"\x1b[C",
+        b"\x1bOD",
+        b"\x1bOS",
+        b"\x1b[1;5D",
+        b"\x1b[15~",
+        b"\x1bd",
+        b"\x1bO\x1b[D",
+    ],
+)
+def test_arrows_function_keys_and_alt_never_drive(terminal, sent):
+    """The sequence of the left arrow ends with a D, which is no key that was pressed."""
+    for _ in range(4):
+        hands = terminal.type(sent.decode())
+        assert (hands.human, hands.autonomy, hands.rearms) == (False, False, 0)
+    # It also ends what was held.
+    for _ in range(4):
+        held = terminal.type("w")
+    assert held.human
+    assert not terminal.type(sent.decode()).human
+
+
+def test_a_sequence_cut_in_two_is_one_and_a_stop_is_never_part_of_one(terminal):
+    for _ in range(4):
+        assert not terminal.type("\x1b[").human
+        assert not terminal.type("D").human
+    assert terminal.type("\x1b").stops == 0
+    assert terminal.type(" ").stops == 1  # Esc and then space, which look like Alt and space
+    assert terminal.type("\x1b ").stops == 2
+    for _ in range(3):
+        held = terminal.type("w")
+    assert held.human
 
 
 def test_the_terminal_is_given_back_and_no_terminal_is_refused(terminal, tmp_path):

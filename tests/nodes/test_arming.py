@@ -28,6 +28,7 @@ class World:
         self.instances = {}
         self.silent = set()
         self.states = dict.fromkeys(NODES, "active")
+        self.texts = {}
         self.recorded = False
         self.xy = (0.0, 0.0)
         self.command = (0.8, 0.1)
@@ -61,7 +62,9 @@ class World:
                 for name in NODES:
                     if name not in self.silent:
                         recorded = self.recorded and name == "camera"
-                        self.arming.heard_status(name, self.states[name], "text", self.info(name), recorded)
+                        self.arming.heard_status(
+                            name, self.states[name], self.texts.get(name, "text"), self.info(name), recorded
+                        )
             if self.ms % 40 == 0 and "motor" not in self.silent:
                 self.arming.heard_motor(self.info("motor"))
             if self.ms % 20 == 0:

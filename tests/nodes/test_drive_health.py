@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import planar_pose
+from hardware.motor.vesc_replies import Values
 from nodes.bags.writer import BagWriter
 from nodes.control.arming_gates import HandGate
 from nodes.control.stop_causes import is_result, is_stall
@@ -180,6 +181,21 @@ def test_the_reasons_of_the_real_checks_are_told_apart(change, result):
         world.states = {**states, **world.states}
 
     reason = stopped(complete)
+    assert is_result(reason) is result, reason
+
+
+@pytest.mark.parametrize(("fault", "result"), [(4, True), (1, False), (5, False), (15, False)])
+def test_a_fault_of_the_motor_controller_is_a_result_if_the_car_ran_into_something(fault, result):
+    """The texts of the motor node's latch and of the safety node, from the fault code on the wire."""
+    values = Values("A", *[0.0] * 5, 0, 0, fault, *[0.0] * 4)
+    text = f"latched: the VESC reports a fault: {values.fault_name}"
+
+    def faulty(world):
+        world.states = {**world.states, "motor": "fault"}
+        world.texts = {"motor": text}
+
+    reason = stopped(faulty)
+    assert text in reason
     assert is_result(reason) is result, reason
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -192,9 +193,10 @@ def test_diagnostics_and_odometry_are_standard_messages(make):
 # The check itself, with a car pushed by hand: its wheels are those of the simulated car.
 
 
-def push(check, turns, speed=0.2, wheelbase=0.25):
-    """Push a car in both positions; ``turns``: how much of the angle its wheels really take."""
+def push(check, turns, speed=0.2, wheelbase=0.25, pushed_ms=(0, 9000), noise=(0.0, 0.0), seed=0):
+    """Push a car in both positions; ``turns``: how much of the angle its wheels really take; noise of poses in m and rad."""
     x = y = yaw = 0.0
+    rng = np.random.default_rng(seed)
     check.start(0)
     angle = 0.0
     for ms in range(0, 9000, 10):
@@ -203,12 +205,24 @@ def push(check, turns, speed=0.2, wheelbase=0.25):
         if told is None:
             break
         angle += (turns * told - angle) * 0.1  # the servo needs its time
-        step = speed * 0.01
+        step = speed * 0.01 * (pushed_ms[0] <= ms % 4000 < pushed_ms[1])
         yaw += step * math.tan(angle) / wheelbase
         x, y = x + step * math.cos(yaw), y + step * math.sin(yaw)
-        check.pose(x, y, yaw, mono_ns)
+        dx, dy, turn = rng.normal(0.0, [noise[0], noise[0], noise[1]])
+        check.pose(x + dx, y + dy, yaw + turn, mono_ns)
         check.tick(mono_ns)
     return check
+
+
+@pytest.mark.parametrize("noise", [(0.0005, 0.001), (0.001, 0.002)])
+@pytest.mark.parametrize(("turns", "passes"), [(1.0, True), (2.0, False), (0.3, False)])
+def test_noise_of_a_standing_car_is_no_way_that_it_was_pushed(noise, turns, passes):
+    """Pushed for a second of each four: the noise of the others had added up to as much, and halved the curvature."""
+    for seed in range(5):
+        check = push(
+            SteeringCheck(CheckSettings(0.25)), turns, 0.4, pushed_ms=(2000, 3000), noise=noise, seed=seed
+        )
+        assert check.passed == passes, check.text
 
 
 @pytest.mark.parametrize("speed", [0.2, -0.2])
