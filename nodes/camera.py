@@ -153,7 +153,11 @@ class CameraNode(Node):
     def _compressed(self, frame: Frame, stamp_ns: int) -> list[Out]:
         """Encode a frame as JPEG with the same stamp. Empty without subscribers, or if the frame is too early for the rate."""
         wanted = self._config.compressed
-        if wanted is None or not self._subscribers(COMPRESSED_TOPIC) or self._grid.slot(stamp_ns) is None:
+        if (
+            wanted is None
+            or not self._subscribers(COMPRESSED_TOPIC)
+            or self._grid.slot(frame.stamp_mono_ns) is None
+        ):
             return []
         return [
             Out(COMPRESSED_TOPIC, compressed_image_message(frame.rgb, stamp_ns, FRAME_ID, wanted.quality))

@@ -118,7 +118,10 @@ class CompositorNode(Node):
         )  # fmt: skip
         self._poses = {topic: PoseBuffer(max_gap_s=config.max_gap_s) for topic in (_CAR, self._face_topic)}
         self._waiting: _Waiting | None = None
-        self._counts = {"images": 0, "drawn": 0, "extrapolated": 0, "dropped_no_pose": 0, "dropped_bad": 0}
+        self._counts = dict.fromkeys(
+            ("images", "drawn", "extrapolated", "dropped_no_pose", "dropped_bad", "bad_poses"), 0
+        )
+        self._size = (camera.width, camera.height)
         self._last_image_ns: int | None = None
         self._now_ns = 0
         self._trouble = ""
@@ -142,8 +145,7 @@ class CompositorNode(Node):
             self._switch.heard(message, now.real_ns)
             return []
         if topic != self._image_topic:
-            self._poses[topic].add(stamp_ns(message), pose_matrix(message))
-            return self._release(now)
+            return self._take_pose(topic, message, now)
         self._last_image_ns = now.mono_ns
         self._counts["images"] += 1
         try:
@@ -164,6 +166,10 @@ class CompositorNode(Node):
                 Out("/compositor/image", out),
                 self._label(image, False, refusal or "no attack file"),
             ]
+        if (image.width, image.height) != self._size:
+            self._counts["dropped_bad"] += 1
+            self._trouble = f"image dropped: expected {self._size[0]} x {self._size[1]}, as calibrated, got {image.width} x {image.height}"
+            return before
         self._waiting = _Waiting(image, stamp_ns(image), now.mono_ns + self._wait_ns)
         return before + self._release(now)
 
@@ -199,6 +205,18 @@ class CompositorNode(Node):
         self._showing = showing
         self._takeover_ms = 1e3 * (time.perf_counter() - start)
         return before
+
+    def _take_pose(self, topic: str, message: Any, now: Now) -> list[Out]:
+        """Note a pose. One that is none is as good as a lost one: the image is dropped, not passed on as if the face were out of view."""
+        try:
+            T = pose_matrix(message)
+        except MessageError:
+            T = np.full((4, 4), np.nan)
+        if not np.isfinite(T).all():
+            self._counts["bad_poses"] += 1
+            return []
+        self._poses[topic].add(stamp_ns(message), T)
+        return self._release(now)
 
     def _release(self, now: Now) -> list[Out]:
         waiting = self._waiting

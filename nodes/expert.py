@@ -22,6 +22,7 @@ from advnerf_core.geometry import wrap_angle, yaw_of
 from advnerf_core.strict import StrictModel
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import drive_message, header, pose_matrix, stamp_ns, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
@@ -30,6 +31,7 @@ _CAR, _STATE = "/vicon/car", "/safety/state"
 _SPEED_BASE_S = 0.15
 _JUMP_M = 0.5
 _ARMED_AGE_S = 0.5
+_SET_BACK_NS = NS_PER_S  # an older stamp than this was given by another time of the clock
 
 
 class Disturbance(StrictModel):
@@ -152,11 +154,16 @@ class ExpertNode(Node):
             self._armed_ns = info.publish_mono_ns if message.armed else None
             return []
         capture_ns = stamp_ns(message)
-        T = pose_matrix(message)
+        try:
+            T = pose_matrix(message)
+        except MessageError:
+            T = np.full((4, 4), np.nan)
         if not np.isfinite(T).all() or now.real_ns - capture_ns > self._config.max_age_s * NS_PER_S:
             self._stale += 1
             return []
         x_m, y_m, yaw_rad = float(T[0, 3]), float(T[1, 3]), yaw_of(T)
+        if self._track and capture_ns < self._track[-1][0] - _SET_BACK_NS:
+            self._track.clear()  # the clock was set back: what was measured before is not comparable
         if self._track and capture_ns <= self._track[-1][0]:
             return []
         speed_mps = self._follow(capture_ns, x_m, y_m, yaw_rad)

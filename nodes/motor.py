@@ -326,7 +326,7 @@ class MotorNode(Node):
             input_voltage_v=values.v_in,
             motor_current_a=values.motor_current_a,
             input_current_a=values.input_current_a,
-            mosfet_temperature_c=values.temp_fet_c or 0.0,
+            mosfet_temperature_c=values.hottest_fet_c or 0.0,
             fault=values.fault,
             fault_text=values.fault_name if values.fault else "",
         )

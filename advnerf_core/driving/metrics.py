@@ -21,6 +21,8 @@ _STILL_M, _STILL_TICKS = 0.005, 3
 # A tick inside a longer gap of a pose stream is an error [s].
 _MAX_GAP_S = 0.5
 LAB_OFF_TRACK_M = 0.4
+# A drive begins when the armed car is farther than this from where it was armed [m].
+MOVED_M = 0.01
 
 
 def mean_cte_limit_m(off_track_m: float = LAB_OFF_TRACK_M) -> float:

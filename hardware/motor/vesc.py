@@ -8,6 +8,8 @@ the rpm.
 from __future__ import annotations
 
 import math
+import os
+import select
 import time
 from types import TracebackType
 from typing import TypeVar
@@ -66,9 +68,7 @@ class Vesc:
     def open(self) -> None:
         """Open the port for this process alone."""
         try:
-            self._serial = serial.Serial(
-                self.port, baudrate=115200, timeout=0, write_timeout=self._write_timeout_s, exclusive=True
-            )
+            self._serial = serial.Serial(self.port, baudrate=115200, timeout=0, exclusive=True)
         except (serial.SerialException, OSError, ValueError) as error:
             if "exclusively lock" in str(error) or "Resource temporarily unavailable" in str(error):
                 raise DeviceBusy(
@@ -195,7 +195,12 @@ class Vesc:
             data = self._serial.read(self._serial.in_waiting)
         except OSError as error:  # pyserial's errors are OSErrors; a hang-up also raises the bare one
             raise LinkLost(f"lost the VESC at {self.port} ({error}); check the USB cable") from error
-        replies = [reply for payload in self._frames(data) if (reply := self._decode(payload)) is not None]
+        frames = self._frames(data)
+        try:
+            replies = [reply for payload in frames if (reply := self._decode(payload)) is not None]
+        except ProtocolError:
+            self.last_reply_mono_ns = time.monotonic_ns()  # an answer, though one that is not understood
+            raise
         if replies:
             self.last_reply_mono_ns = time.monotonic_ns()
         return replies
@@ -261,12 +266,18 @@ class Vesc:
     def _write(self, data: bytes) -> None:
         if self._serial is None:
             raise LinkLost(f"expected an open port, but {self.port} is closed; call open() first")
+        deadline = time.monotonic() + self._write_timeout_s
+        left = data
         try:
-            self._serial.write(data)
-        except serial.SerialTimeoutException as error:
-            raise LinkTimeout(
-                f"expected {self.port} to take {len(data)} bytes, but it is blocked; the VESC hangs. Restart it"
-            ) from error
+            # pyserial's own write takes a process that was held up for a blocked port, though all bytes were accepted.
+            while left := left[_accepted(self._serial.fileno(), left) :]:
+                wait_s = deadline - time.monotonic()
+                if wait_s <= 0.0 or not select.select([], [self._serial.fileno()], [], wait_s)[1]:
+                    raise LinkTimeout(
+                        f"expected {self.port} to take {len(data)} bytes, but it is blocked; the VESC hangs. Restart it"
+                    )
+        except LinkTimeout:
+            raise
         except OSError as error:
             raise LinkLost(f"lost the VESC at {self.port} ({error}); check the USB cable") from error
 
@@ -280,3 +291,11 @@ class Vesc:
             write_mono_ns=time.monotonic_ns(),
             write_real_ns=time.time_ns(),
         )
+
+
+def _accepted(fd: int, data: bytes) -> int:
+    """Number of bytes that a port took; 0 of a full one."""
+    try:
+        return os.write(fd, data)
+    except BlockingIOError:
+        return 0

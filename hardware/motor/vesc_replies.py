@@ -102,6 +102,20 @@ class Values:
         """Name of the fault code."""
         return FAULT_NAMES.get(self.fault, f"code {self.fault}")
 
+    @property
+    def hottest_fet_c(self) -> float | None:
+        """Temperature of the hottest MOSFET [degC]: of one sensor, or of firmware up to 3.00 of six; None if none is reported."""
+        each = [
+            self.temp_fet_c,
+            self.temp_mos1_c,
+            self.temp_mos2_c,
+            self.temp_mos3_c,
+            self.temp_mos4_c,
+            self.temp_mos5_c,
+            self.temp_mos6_c,
+        ]
+        return max((temperature for temperature in each if temperature is not None), default=None)
+
 
 _WHOLE = {"tachometer", "tachometer_abs", "fault", "controller_id", "status"}
 

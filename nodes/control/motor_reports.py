@@ -108,7 +108,9 @@ def _controller(report: ControllerReport) -> _Row:
         return "controller", ERROR, report.link, numbers
     if values.fault:
         return "controller", ERROR, f"fault: {values.fault_name}", numbers
-    temperatures = [t for t in (values.temp_fet_c, values.temp_motor_c, values.temp_pcb_c) if t is not None]
+    temperatures = [
+        t for t in (values.hottest_fet_c, values.temp_motor_c, values.temp_pcb_c) if t is not None
+    ]
     hottest = max(temperatures, default=0.0)
     numbers["hottest [degC]"] = f"{hottest:.1f}"
     return (

@@ -1,16 +1,17 @@
 """A trial on the page: one drive from the start pose over a fixed time, and how far it left the path. Pure.
 
-The trial runs from the moment the car is armed. Its metrics equal those of ``advnerf car trial`` and ``advnerf bag evaluate``. A trial that a
-fault of the stack ended has no metrics, by the rule for stops that those commands have too.
+The trial runs from the first motion of the armed car, as those of ``advnerf car trial`` and the drives of ``advnerf bag evaluate`` do. A trial
+that a fault of the stack ended has no metrics, by the rule for stops that those commands have too.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
-from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.metrics import MOVED_M, Horizon, drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
 from nodes.control.stop_causes import is_result
 from nodes.runtime.clock import NS_PER_S
@@ -33,13 +34,14 @@ class Trial:
         self._horizon = Horizon(ticks=ticks, dt_s=dt_s, off_track_m=off_track_m)
         self.phase, self.number, self.attack_id = IDLE, 0, ""
         self._began_ns = 0
+        self._armed_at_m: tuple[float, float] | None = None
         self._states: list[tuple[float, float]] = []
         self._result: dict[str, Any] = {}
         self._stopped = ""
 
     def start(self) -> None:
-        """Begin a new trial, which waits for the car to be armed."""
-        self.phase, self.number = WAITING, self.number + 1
+        """Begin a new trial, which waits for the car to be armed and to move."""
+        self.phase, self.number, self._armed_at_m = WAITING, self.number + 1, None
         self._states, self._result, self.attack_id, self._stopped = [], {}, "", ""
 
     def step(
@@ -57,9 +59,11 @@ class Trial:
             attack_id: The attack that is drawn now; empty for none.
             reason: Why the car is not armed.
         """
-        if self.phase == WAITING and armed and position_m is not None:
-            self.phase, self._began_ns = RUNNING, mono_ns
-            self._states = [position_m]
+        if self.phase == WAITING and position_m is not None:
+            self._armed_at_m = (self._armed_at_m or position_m) if armed else None
+            if self._armed_at_m is not None and math.dist(position_m, self._armed_at_m) > MOVED_M:
+                self.phase, self._began_ns = RUNNING, mono_ns
+                self._states = [position_m]
         if self.phase != RUNNING:
             return False
         self.attack_id = self.attack_id or attack_id

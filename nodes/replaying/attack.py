@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from advnerf_core.files import write_json
 from nodes.bags.decoded import read_decoded
 from nodes.bags.reader import read_info
+from nodes.control.attack_receiver import ATTACK_FILE
+from nodes.control.interlock import ATTACK_SWITCH
 from nodes.replaying.nodes import Choice
 from nodes.replaying.replay import Replay
 from nodes.runtime.clock import NS_PER_S
@@ -27,6 +29,8 @@ from nodes.runtime.topics import topic as topic_row
 
 _DRIVE, _LABEL = "/policy/drive", "/compositor/attack"
 _COMPOSITOR = "compositor"
+# What the operator chose to show then, which is nothing in a clean drive.
+_WHAT_WAS_SHOWN = (ATTACK_SWITCH, ATTACK_FILE)
 _DEG = 180.0 / np.pi
 Array = NDArray[np.float64]
 
@@ -199,9 +203,10 @@ def _steering(
     """Run one replay. Returns steering [rad] and compositor labels (drawn, attack id) by capture stamp, and the digest."""
     steering: dict[int, float] = {}
     labels: dict[int, tuple[bool, str]] = {}
-    with Replay(
-        bag, Choice(choice.nodes, choice.replacements, choice.launch, (*choice.overrides, setting))
-    ) as replay:
+    own = () if _COMPOSITOR in choice.replacements else (f"{_COMPOSITOR}.interlock=false",)
+    settings = (*choice.overrides, *own, setting)
+    again = Choice(choice.nodes, choice.replacements, choice.launch, settings)
+    with Replay(bag, again, unheard=_WHAT_WAS_SHOWN) as replay:
         if _DRIVE not in replay.made_topics:
             raise BagError(
                 f"expected a policy, which publishes {_DRIVE}, among --nodes, got {', '.join(replay.names)}; add it"

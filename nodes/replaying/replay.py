@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from nodes.bags.info import BagMessage
@@ -29,12 +29,13 @@ class Replay:
 
     Args:
         whole: Also yield messages of the bag to which no node subscribes (to write another bag).
+        unheard: Topics whose recorded messages no node gets.
 
     Topics that are not in the topic table are skipped and listed in `left_out`. Iterate once; then `summary` is complete. Use it as a
     context manager: leaving it closes the nodes.
     """
 
-    def __init__(self, bag: Path, choice: Choice, whole: bool = False) -> None:
+    def __init__(self, bag: Path, choice: Choice, whole: bool = False, unheard: Collection[str] = ()) -> None:
         self.info = read_info(bag)
         self.bag, self._whole = bag, whole
         self._folder = tempfile.TemporaryDirectory(prefix="advnerf-replay-")
@@ -47,9 +48,8 @@ class Replay:
             self._gaps_ahead = deque(self._gaps)
             recorded = [topic.name for topic in self.info.topics]
             self.left_out = [topic for topic in recorded if type_of_topic(topic) is None]
-            self._heard = [
-                topic for topic in recorded if topic in self._lockstep.heard_topics - self.made_topics
-            ]
+            heard = self._lockstep.heard_topics - self.made_topics - set(unheard)
+            self._heard = [topic for topic in recorded if topic in heard]
             require_readable(bag, {topic: topic_row(topic).type for topic in self._heard})
             if not self._heard:
                 raise BagError(

@@ -168,6 +168,28 @@ def test_silence_and_blockage_end_in_time_outs():
         os.close(slave)
 
 
+def test_a_process_that_was_held_up_after_a_write_has_not_met_a_blocked_port(monkeypatch):
+    """All bytes were accepted; that the clock went on meanwhile says nothing about the controller."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    try:
+        vesc = Vesc(os.ttyname(slave), VehicleGains(), DriveLimits(), write_timeout_s=0.02)
+        vesc.open()
+
+        def late(fd, data, write=os.write):
+            taken = write(fd, data)
+            time.sleep(0.05)
+            return taken
+
+        monkeypatch.setattr("hardware.motor.vesc.os.write", late)
+        assert vesc.brake(5.0).brake_current_a == pytest.approx(5.0)
+        assert vesc.is_open
+        vesc.abandon()
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
 def test_the_car_moves_and_telemetry_says_so(emulator):
     with driver(emulator) as vesc, running(emulator):
         for _ in range(14):

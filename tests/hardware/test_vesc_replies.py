@@ -108,3 +108,13 @@ def test_values_round_trip():
     )
     again = decode_values(encode_values(values))
     assert (again.erpm, again.duty, again.temp_fet_c, again.controller_id) == (100, 0.5, 30.0, 3)
+
+
+@pytest.mark.parametrize(
+    ("temperatures", "hottest"),
+    [({"temp_fet_c": 40.0}, 40.0), ({"temp_mos1_c": 85.3, "temp_mos6_c": 31.0}, 85.3), ({}, None)],
+)
+def test_the_hottest_mosfet_is_of_one_sensor_or_of_six(temperatures, hottest):
+    """Firmware up to 3.00 has six; its temperature had been published as 0."""
+    values = Values("A", *[0.0] * 5, 0, 0, 0, *[0.0] * 4, **temperatures)
+    assert values.hottest_fet_c == hottest

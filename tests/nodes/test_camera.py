@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -91,6 +92,13 @@ def test_compressed_rate_is_its_own_and_nothing_is_done_for_nobody():
     topics = [out.topic for k in range(20) for out in made.receive(frame(k, 0.1 * k), CLOCK.now())]
     assert topics.count("/camera/image_raw") == 20
     assert topics.count("/camera/image_raw/compressed") == 8
+    # After the clock was set back by ten minutes, the pictures go on.
+    back = [
+        replace(frame(k, 0.1 * k), stamp_realtime_ns=frame(k, 0.1 * k - 600.0).stamp_realtime_ns)
+        for k in range(20, 40)
+    ]
+    after = [out.topic for each in back for out in made.receive(each, CLOCK.now())]
+    assert after.count("/camera/image_raw/compressed") == 8
     alone = node(config(compressed={}), subscribers=lambda topic: 0)
     assert len(alone.receive(frame(), CLOCK.now())) == 2
     without = node(config())

@@ -169,6 +169,38 @@ def test_without_poses_in_reach_the_image_is_dropped_and_counted(bench):
     assert "dropped" in bench.node.status()[1]
 
 
+@pytest.mark.parametrize("bad", ["nan", "zero quaternion"])
+@pytest.mark.parametrize("topic", ["/vicon/board", "/vicon/car"])
+def test_a_pose_that_is_none_is_as_good_as_a_lost_one(bench, topic, bad):
+    """A clean image under "out of view" would be taken for a drive without an attack."""
+    for t in (0.0, 0.01):
+        bench.poses(t)
+    stamp = T0 + 200_000_000
+    message = pose_message(T_WORLD_FROM_BOARD, stamp)
+    pose = message.pose
+    if bad == "nan":
+        pose.position.x = float("nan")
+    else:
+        pose.orientation.x = pose.orientation.y = pose.orientation.z = pose.orientation.w = 0.0
+    bench.send(topic, message)
+    bench.image(0.2)
+    bench.pass_time(0.05)
+    assert bench.out == []
+    counters = bench.node.counters()
+    assert (counters["bad_poses"], counters["dropped_no_pose"]) == (1, 1)
+
+
+def test_an_image_of_another_size_than_calibrated_is_dropped_and_counted(bench):
+    for t in (0.0, 0.01):
+        bench.poses(t)
+    other = image_message(np.full((100, 100, 3), 90, np.uint8), T0 + 5_000_000, "camera")
+    bench.send("/camera/image_raw", other)
+    bench.pass_time(0.05)
+    assert bench.out == []
+    assert bench.node.counters()["dropped_bad"] == 1
+    assert "expected 336 x 188, as calibrated, got 100 x 100" in bench.node.status()[1]
+
+
 def test_two_images_never_wait(bench):
     for t in (0.0, 0.01):
         bench.poses(t)

@@ -214,3 +214,25 @@ def test_an_estop_is_not_confirmed_until_the_motor_node_brakes(hand, capsys):
     assert "NOT CONFIRMED" not in hand.node.status()[1]
     said = capsys.readouterr().err.splitlines()
     assert [line.split(":")[1] for line in said] == [" NOT CONFIRMED", " the car is stopped"]
+
+
+def test_the_expert_drives_on_after_the_clock_was_set_back():
+    """For as long as it went back, each pose had been older than the last."""
+    car = Car((-0.5, -2.0, 0.0))
+    car.run(1.0)
+    before = len(car.states)
+    now = car.clock.now()
+    car.clock = ManualClock(now.mono_ns, now.real_ns - 600 * 10**9)
+    car.run(1.0)
+    assert len(car.states) > 1.8 * before
+
+
+def test_a_pose_that_is_none_is_stale_to_the_expert():
+    car = Car((-0.5, -2.0, 0.0))
+    car.run(0.5)
+    now = car.clock.now()
+    message = pose_message(planar_pose(0.0, -2.0, 0.0), now.real_ns)
+    o = message.pose.orientation
+    o.x = o.y = o.z = o.w = 0.0
+    assert car.node.handle("/vicon/car", message, MessageInfo(now.mono_ns, now.mono_ns), now) == []
+    assert car.run(0.5).size

@@ -13,7 +13,7 @@ from advnerf_core.geometry import planar_pose
 from benchmarks.host_pair import exchange_keys
 from calibration.schema import CalibrationError
 from hardware.mocap.vicon import free_udp_port
-from nodes.bags.reader import read_messages
+from nodes.bags.reader import read_attachments, read_messages
 from nodes.bags.writer import BagWriter
 from nodes.cli.main import app
 from nodes.lab.trials.bags import evaluate_bag, find_drives
@@ -243,6 +243,60 @@ def test_the_numbers_of_a_bag_follow_from_the_bag_alone(tmp_path):
     np.testing.assert_allclose(
         whole["cte_m"], path.project(np.array(whole["states"])[:, :2]).cte_m, atol=1e-9
     )
+
+
+def copied(bag, folder, keep=lambda message: True, more=()):
+    """A bag again, without some of its messages and with others ``(topic, message, ns)``, in the order of time."""
+    with BagWriter(folder, read_attachments(bag)) as writer:
+        old = [(each.log_ns, each.topic, each.cdr) for each in read_messages(bag) if keep(each)]
+        new = [(at_ns, topic, encode(message)) for topic, message, at_ns in more]
+        for number, (at_ns, topic, cdr) in enumerate(sorted([*old, *new], key=lambda each: each[0])):
+            writer.write(topic, cdr, at_ns, at_ns, number)
+    return folder
+
+
+@pytest.mark.parametrize("topic", ["/compositor/attack", "/monitor/attack"])
+def test_each_drive_of_a_bag_has_the_attacks_that_were_shown_in_it(tmp_path, topic):
+    """A label of an image is for that image; a screen is labelled when its content changes."""
+    drives = [(1.0, 2.2, "disarmed by trial: trial is over")] * 3
+    bag = write_bag(tmp_path, drives)
+    spans = find_drives(bag)
+
+    def label(at_ns, attack_id, drawn):
+        return (
+            topic,
+            types.AttackStamp(header=header(at_ns), attack_id=attack_id, drawn=drawn, reason=""),
+            at_ns,
+        )
+
+    first, second, third = ((span.start_real_ns, span.end_real_ns) for span in spans)
+    if topic == "/compositor/attack":
+        labels = [label(at, "aaaa", at < first[1]) for at in range(first[0], second[1], NS_PER_S // 10)]
+        labels += [label(at, "bbbb", True) for at in range(third[0], third[1], NS_PER_S // 10)]
+    else:
+        half_s = NS_PER_S // 2
+        labels = [label(first[0] - half_s, "aaaa", True), label(first[1] + half_s // 10, "aaaa", False)]
+        labels += [label(third[0] - half_s, "bbbb", True)]
+    shown = copied(bag, tmp_path / "shown", more=labels)
+    assert [drive["attack_ids"] for drive in evaluate_bag(shown, None, ticks=20)] == [["aaaa"], [], ["bbbb"]]
+
+
+def test_a_car_that_is_carried_away_after_its_drive_stopped_costs_no_drive(tmp_path):
+    """It had cost all drives of the bag, by a traceback."""
+    drives = [(1.0, 1.0, "the car is outside the fence"), (3.0, 2.2, "disarmed by trial: trial is over")]
+    bag = write_bag(tmp_path, drives)
+    stop_ns = find_drives(bag)[0].end_real_ns
+    hidden = range(stop_ns + NS_PER_S // 5, stop_ns + 2 * NS_PER_S)
+    gap = copied(bag, tmp_path / "gap", lambda each: each.topic != "/vicon/car" or each.log_ns not in hidden)
+    expected, found = (evaluate_bag(each, None, ticks=20) for each in (bag, gap))
+    assert [drive["total_cte_m"] for drive in found] == [drive["total_cte_m"] for drive in expected]
+    # Hidden while it drives, it is one error that names the drive.
+    driving = range(stop_ns - NS_PER_S * 9 // 10, stop_ns - NS_PER_S // 10)
+    lost = copied(
+        bag, tmp_path / "lost", lambda each: each.topic != "/vicon/car" or each.log_ns not in driving
+    )
+    with pytest.raises(BagError, match=r"the drive at \d+\.\d s of .*lost: expected no gap"):
+        evaluate_bag(lost, None, ticks=20)
 
 
 def test_numbers_of_a_bag_without_checksums_are_unchecked(tmp_path):

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from advnerf_core.driving.metrics import Horizon
+from advnerf_core.driving.metrics import MOVED_M, Horizon
 from advnerf_core.driving.path import Path as DrivingPath
 from calibration.schema import RoomCalibration, load_calibration, parse_calibration
 from nodes.bags.decoded import read_decoded
 from nodes.bags.reader import read_attachments, read_info
 from nodes.bags.time_gaps import skipped_gaps
-from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
-from nodes.lab.trials.trial import MOVED_M
+from nodes.lab.trials.evaluation import SHOWN_BY, attack_ids, counterfactual, score, timing, trajectory
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import pose_matrix, stamp_ns
@@ -71,6 +70,11 @@ def find_drives(bag: Path) -> list[DriveSpan]:
     return spans
 
 
+def _ticks_until(stopped_s: float, horizon: Horizon) -> int:
+    """Ticks that a drive needs poses for: what comes after its stop is held, and the car may be carried away."""
+    return min(horizon.ticks, int(stopped_s / horizon.dt_s) + 2)
+
+
 def measure_drive(
     bag: Path, span: DriveSpan, path: DrivingPath, horizon: Horizon, stopped: str
 ) -> dict[str, Any]:
@@ -79,15 +83,19 @@ def measure_drive(
     Args:
         stopped: Why the car was stopped before the horizon's end; empty if it was not. Its last error is then held.
     """
-    states = trajectory(bag, span.start_real_ns, horizon)
     stopped_s = (span.end_real_ns - span.start_real_ns) / NS_PER_S if stopped else None
+    driven = horizon if stopped_s is None else replace(horizon, ticks=_ticks_until(stopped_s, horizon))
+    try:
+        states = trajectory(bag, span.start_real_ns, driven)
+    except ValueError as error:
+        raise BagError(f"the drive at {span.start_real_ns / NS_PER_S:.1f} s of {bag}: {error}") from error
     metrics, held = score(states, path, horizon, stopped_s)
     if len(held) < horizon.ticks + 1:
         raise BagError(
             f"expected {horizon.ticks} ticks of {horizon.dt_s:g} s in {bag}, got {len(states) - 1}; reduce --ticks"
         )
     found: dict[str, Any] = {
-        "attack_ids": sorted(attack_ids(bag)),
+        "attack_ids": sorted(attack_ids(bag, SHOWN_BY, span.start_real_ns, span.end_real_ns)),
         "states": held.tolist(),
         "stopped_early": stopped,
         "cte_m": path.project(held[:, :2]).cte_m.tolist(),

@@ -30,7 +30,8 @@ HOPS = {
 }
 SENT = "/motor/sent"
 # Topics on which nodes report that they show an attack, with its id.
-SHOWN_BY = ("/compositor/attack", "/monitor/attack")
+_IN_IMAGES = "/compositor/attack"
+SHOWN_BY = (_IN_IMAGES, "/monitor/attack")
 _CAR, _SEEN = "/vicon/car", "/compositor/image"
 COUNTERFACTUAL = "/policy/counterfactual"
 _NS_PER_MS = 1e6
@@ -147,12 +148,23 @@ def frames(bag: Path, start_real_ns: int, count: int, period_s: float = 0.1) -> 
     return np.stack([images[index] for index in newest])
 
 
-def attack_ids(bag: Path, topics: Sequence[str] = SHOWN_BY) -> set[str]:
-    """Ids of the attacks that were drawn into at least one frame or shown on the monitor."""
+def attack_ids(
+    bag: Path, topics: Sequence[str] = SHOWN_BY, start_real_ns: int = 0, end_real_ns: int = 2**63
+) -> set[str]:
+    """Ids of the attacks that were drawn into at least one frame, or shown on the monitor, between two times [ns, CLOCK_REALTIME]."""
     present = {topic.name for topic in read_info(bag).topics}
-    return {
-        str(m.attack_id) for name in topics if name in present for m in read_decoded(bag, name) if m.drawn
-    }
+    found = set[str]()
+    for name in (each for each in topics if each in present):
+        labels = [(ns_from_stamp(m.header.stamp), str(m.attack_id), m.drawn) for m in read_decoded(bag, name)]
+        # The label of an image is for that image; a screen shows the same until its next label.
+        ends = [at for at, _, _ in labels]
+        ends = ends if name == _IN_IMAGES else [*ends[1:], end_real_ns][: len(labels)]
+        found |= {
+            attack_id
+            for (at, attack_id, drawn), end in zip(labels, ends, strict=True)
+            if drawn and at < end_real_ns and end >= start_real_ns
+        }
+    return found
 
 
 def counterfactual(bag: Path, start_real_ns: int, end_real_ns: int) -> Counterfactual | None:

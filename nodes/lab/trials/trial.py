@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.driving.metrics import MOVED_M
 from advnerf_core.geometry import planar_pose, wrap_angle, yaw_of
 from nodes.runtime.arm_requests import BRAKE_WAIT_S, arm_message
 from nodes.runtime.clock import NS_PER_S, Now
-from nodes.runtime.errors import NodeFinished, RuntimeFault
+from nodes.runtime.errors import MessageError, NodeFinished, RuntimeFault
 from nodes.runtime.messages import ns_from_stamp, pose_matrix, pose_message
 from nodes.runtime.node import MessageInfo, Node, Out
 from nodes.runtime.requests import RequestIdentity
@@ -26,7 +27,6 @@ from nodes.runtime.twin_port import is_twin
 
 _REPEAT_S = 0.5
 _SETTLE_S = 0.5
-MOVED_M = 0.01
 _AT_START_M, _AT_START_RAD = 0.03, 0.05
 _SPOT_M = 0.005
 _STANDING_S = 0.5
@@ -168,7 +168,10 @@ class TrialNode(Node):
         return "active", self.phase.value
 
     def _see_car(self, message: Any, now: Now) -> None:
-        T, stamp_ns = pose_matrix(message), ns_from_stamp(message.header.stamp)
+        try:
+            T, stamp_ns = pose_matrix(message), ns_from_stamp(message.header.stamp)
+        except MessageError:
+            return  # not a pose: as if none had come
         seen = self._seen
         # Speed from consecutive poses would be noise. The car stands if it has not left a spot for some time.
         if seen.spot_m is None or float(np.linalg.norm(T[:3, 3] - seen.spot_m)) > _SPOT_M:

@@ -10,13 +10,22 @@ from nodes.operator_page.trial import DONE, RUNNING, WAITING, Trial
 MS = 1_000_000
 
 
-def test_it_samples_the_control_ticks_from_arming_on():
+def armed_at(trial, position_m, ms=-20):
+    """The car is armed 2 cm beside this position, where its drive begins."""
+    x, y = position_m
+    assert not trial.step(True, (x - 0.02, y), "", ms * MS)
+    assert trial.phase == WAITING
+
+
+def test_it_samples_the_control_ticks_from_the_first_motion_on():
     path = Path.rounded_square(4.0, 1.0)
     trial = Trial(path, 0.4, ticks=20, dt_s=0.1)
     trial.start()
     assert not trial.step(False, (0.0, 0.0), "", 0)
     assert trial.phase == WAITING
     track = [tuple(np.add(path.pose_at(0.08 * k)[:2], [0.0, 0.01 * k])) for k in range(21)]
+    armed_at(trial, track[0], 4500)
+    armed_at(trial, track[0], 4980)
     ended = []
     for ms in range(5000, 8000, 20):
         position = track[(ms - 5000) // 100]
@@ -37,6 +46,7 @@ def test_a_car_that_stops_is_charged_for_the_rest():
     trial = Trial(path, 0.4, ticks=10)
     trial.start()
     beside = tuple(np.add(path.pose_at(0.0)[:2], [0.0, 0.3]))
+    armed_at(trial, beside)
     for ms in range(0, 500, 20):
         assert not trial.step(True, beside, "", ms * MS)
     assert trial.step(False, beside, "", 500 * MS)
@@ -60,6 +70,7 @@ def test_a_car_that_stops_is_charged_for_the_rest():
 def test_a_trial_that_a_fault_of_the_stack_ended_is_no_result(reason, counts):
     trial = Trial(Path.rounded_square(4.0, 1.0), 0.4, ticks=60)
     trial.start()
+    armed_at(trial, (0.0, -2.3))
     for ms in range(0, 250, 20):
         assert not trial.step(True, (0.0, -2.3), "", ms * MS)
     assert trial.step(False, (0.0, -2.3), "", 250 * MS, reason)
@@ -71,7 +82,20 @@ def test_a_trial_that_a_fault_of_the_stack_ended_is_no_result(reason, counts):
 def test_without_a_path_it_only_counts():
     trial = Trial(None, 0.4, ticks=3)
     trial.start()
+    armed_at(trial, (0.0, 0.0))
     for ms in range(0, 400, 20):
         trial.step(True, (0.0, 0.0), "", ms * MS)
     assert "total_cte_m" not in trial.state()
     assert trial.state()["phase"] == DONE
+
+
+def test_a_car_that_is_disarmed_before_it_moves_begins_no_trial():
+    """As in a bag, where such an arming is no drive; the next one begins at its own place."""
+    trial = Trial(None, 0.4, ticks=3)
+    trial.start()
+    assert not trial.step(True, (0.0, 0.0), "", 0)
+    assert not trial.step(False, (0.0, 0.0), "", 100 * MS, "no pose of the car for 0.21 s")
+    assert not trial.step(True, (0.5, 0.0), "", 200 * MS)  # carried there
+    assert trial.phase == WAITING
+    assert not trial.step(True, (0.52, 0.0), "", 300 * MS)
+    assert trial.phase == RUNNING

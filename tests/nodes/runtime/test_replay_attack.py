@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 
 from nodes.bags.info import BagMessage
-from nodes.bags.reader import read_attachments, read_messages
+from nodes.bags.reader import read_attachments, read_info, read_messages
+from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
 from nodes.replaying.attack import plot_retro_attack, retro_attack
 from nodes.replaying.golden import Golden, Tolerances, compare
 from nodes.replaying.nodes import Choice
 from nodes.replaying.replay import Replay, write_replay
 from nodes.runtime.errors import BagError, ConfigError
-from nodes.runtime.messages import decode, drive_message, encode, type_name
+from nodes.runtime.messages import decode, drive_message, encode, header, type_name, types
 from nodes.runtime.topics import topic as topic_row
 from tests.support.replays import CORNER, GOLDEN_FOLDER, GREEN, START_NS, pose, run
 
@@ -73,6 +74,26 @@ def test_retro_attack_is_the_difference_of_two_drives(clean_drive, tmp_path):
     assert [row["delta_rad"] for row in saved["images"]] == pytest.approx(delta, abs=1e-7)
     plot_retro_attack(result, tmp_path / "retro.png")
     assert (tmp_path / "retro.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_what_was_shown_in_the_recording_does_not_hide_the_attack(clean_drive, tmp_path):
+    """A clean drive under "Attack off" on the page, and one of a car that was pushed, so never armed."""
+    attack = tmp_path / "new.attack.safetensors"
+    attack.write_bytes(read_attachments(CORNER)["corner.attack.safetensors"])
+    expected = retro_attack(clean_drive, attack, GREEN)
+    start_ns = read_info(clean_drive).start_ns
+    with BagWriter(
+        tmp_path / "off", read_attachments(clean_drive), read_info(clean_drive).metadata
+    ) as writer:
+        switch = types.AttackSwitch(header=header(start_ns), show=False, source="Ann")
+        writer.write("/attack/switch", encode(switch), start_ns, start_ns, 0)
+        for m in read_messages(clean_drive):
+            writer.write(m.topic, m.cdr, m.log_ns, m.publish_ns, m.sequence)
+    locked = Choice(GREEN.nodes, GREEN.replacements, None, ("compositor.interlock=true",))
+    for bag, choice in ((tmp_path / "off", GREEN), (clean_drive, locked)):
+        found = retro_attack(bag, attack, choice)
+        assert found.drawn.all()
+        np.testing.assert_array_equal(found.delta_rad, expected.delta_rad)
 
 
 def test_retro_attack_on_the_command_line(clean_drive, tmp_path, capsys):
