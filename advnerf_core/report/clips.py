@@ -8,6 +8,7 @@ import os
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -170,7 +171,9 @@ def _encode(path: Path, rate_hz: float, frames: Iterable[Frames], options: dict[
         stream: Any = None
         for frame in frames:
             if stream is None:
-                stream = container.add_stream("libx264", rate=round(rate_hz), options=options)
+                stream = container.add_stream(
+                    "libx264", rate=Fraction(rate_hz).limit_denominator(1000), options=options
+                )
                 stream.height, stream.width = (side - side % 2 for side in frame.shape[:2])
                 stream.pix_fmt = "yuv420p"
             even = np.ascontiguousarray(frame[: stream.height, : stream.width])

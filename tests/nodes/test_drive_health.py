@@ -89,6 +89,22 @@ def test_timing_and_loops_decide_whether_a_drive_counts(tmp_path, bag, words):
     assert found.startswith(words) if words else found == ""
 
 
+@pytest.mark.parametrize("rate_hz", [10, 30])
+def test_a_faster_camera_makes_up_for_no_pause_and_may_have_as_many_late_commands(tmp_path, rate_hz):
+    """In each 0.4 s the commands pause for 0.2 s; in another drive, one of 25 is late."""
+    every = np.arange(6 * rate_hz) / rate_hz / TICK_S
+    paused = judged(
+        write_bag(tmp_path / "paused", [k for k in every if round(k * TICK_S, 6) % 0.4 < 0.2 - 1e-6])
+    )
+    assert "control ticks had no new command" in paused
+    with BagWriter(tmp_path / "late") as writer:
+        for number, tick in enumerate(every):
+            at_ns = START_NS + round(tick * TICK_S * 1e9)
+            message = sent(at_ns, 0.25 if number % 25 == 0 else 0.05)
+            writer.write("/motor/sent", encode(message), at_ns, at_ns, number)
+    assert judged(tmp_path / "late") == ""
+
+
 @pytest.mark.parametrize("served", [ALL, [k for k in ALL if k % 3]])
 def test_the_verdict_does_not_depend_on_where_the_car_drove(tmp_path, served):
     verdicts = {

@@ -8,18 +8,20 @@ from __future__ import annotations
 import io
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from advnerf_core.documents import parse_json
 from advnerf_core.errors import ConfigError
 from advnerf_core.geometry import Array
 from advnerf_core.inputs import InputFileError, InputFiles
+from advnerf_core.objects.voxel.gltf_checks import has_an_end, refuse_unread
 from advnerf_core.objects.voxel.mesh import MeshError, MeshPart, SurfaceMesh, part_from_colours, stand
 from advnerf_core.srgb import to_display, to_linear
 
@@ -61,6 +63,8 @@ def load_mesh(
             f"expected a mesh with triangles in {path}, got none: is it a point cloud or an empty scene?"
         )
     gltf = path.suffix.lower() in _GLTF
+    if gltf and has_an_end(_gltf_header(path, files.content)):
+        _require_inside(parts, path)
     mesh = stand(SurfaceMesh(tuple(parts)), up or ("y" if gltf else "z"), height_m, str(path))
     if height_m is None:
         mesh = mesh.scaled(_metres(path, mesh, unit, gltf))
@@ -124,14 +128,22 @@ def _metres(path: Path, mesh: SurfaceMesh, unit: str | None, gltf: bool) -> floa
     )
 
 
+_EDGE = 1e-3  # beyond the image, in its sides
+_MTL = re.compile(r".+\.mtl", re.IGNORECASE)
+_PLY_COLOUR = re.compile(r"^property\s+(\w+)\s+((?:diffuse_)?(?:red|green|blue))\s*$", re.MULTILINE)
+_PLY_KINDS = ("uchar", "uint8", "float", "float32", "double", "float64")
 _Read = Callable[[str, str], bytes]
 
 
 def _read_named_by_obj(content: bytes, read: _Read) -> None:
-    for words in _lines(content):
-        if words[0] != "mtllib" or len(words) == 1:
-            continue
-        library = _name(words[1:])
+    libraries = [words[1:] for words in _lines(content) if words[0] == "mtllib" and len(words) > 1]
+    names = [words if all(map(_MTL.fullmatch, words)) else [" ".join(words)] for words in libraries]
+    if len(several := dict.fromkeys(name for each in names for name in each)) > 1:
+        raise MeshError(
+            f"expected one library of materials (mtllib), got {', '.join(several)}; join them into one file, or export the mesh as one GLB"
+        )
+    for words in libraries[:1]:
+        library = _name(words)
         for line in _lines(read(library, library)):
             if line[0].lower() in ("map_kd", "map_ka") and len(line) > 1:
                 image = _name(line[1:])
@@ -140,6 +152,11 @@ def _read_named_by_obj(content: bytes, read: _Read) -> None:
 
 def _read_named_by_ply(content: bytes, read: _Read) -> None:
     header = content.partition(b"end_header")[0].decode(errors="replace")
+    for kind, name in _PLY_COLOUR.findall(header):
+        if kind not in _PLY_KINDS or name.startswith("diffuse_"):
+            raise MeshError(
+                f"expected colours of vertices as uchar or float properties red, green and blue, got {kind} {name}; export it again with those"
+            )
     for image in re.findall(r"^comment\s+TextureFile\s+(.+?)\s*$", header, re.I | re.M):
         read(image, image)
 
@@ -170,6 +187,10 @@ def _read_named_by_gltf(path: Path, content: bytes, read: _Read) -> None:
         raise MeshError(
             f"expected a mesh without the glTF extension {', '.join({*required, *used})}, got {path}; export it again without it"
         )
+    try:
+        refuse_unread(header, path)
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        raise MeshError(f"cannot read {path} as a mesh (glTF: {error!r}); export it again") from error
     for material in header.get("materials", []):
         texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
         if texture.get("texCoord", 0) != 0:
@@ -185,8 +206,6 @@ def _read_named_by_gltf(path: Path, content: bytes, read: _Read) -> None:
 
 def _refuse_broken_images(files: InputFiles) -> None:
     """Reject images that cannot be decoded: trimesh would leave them out, and show white."""
-    from PIL import Image
-
     path = files.path
     contents = [
         (str(path.parent / name), content)
@@ -279,6 +298,16 @@ def _part(geometry: Any, path: Path, notes: list[str]) -> MeshPart:
     return part_from_colours(triangles, np.broadcast_to(_plain_colour(material, linear), (len(faces), 3)))
 
 
+def _require_inside(parts: Sequence[MeshPart], path: Path) -> None:
+    """Raise for texture coordinates beyond the edges of an image that does not repeat there: all images are sampled as repeating."""
+    outside = [each.uv for each in parts if each.texture.shape[:2] != (1, 1)]
+    if any(uv.size and (uv.min() < -_EDGE or uv.max() > 1.0 + _EDGE) for uv in outside):
+        raise MeshError(
+            f"expected texture coordinates within 0..1 in {path}, whose images are clamped or mirrored beyond their edges, got some outside; let them "
+            "repeat, or unwrap the mesh within the image"
+        )
+
+
 def _names_an_image(material: Any) -> bool:
     return any(getattr(material, name, None) is not None for name in ("baseColorTexture", "image"))
 
@@ -311,6 +340,8 @@ def _texture(material: Any, path: Path, linear: bool, notes: list[str]) -> NDArr
     if image is None:
         return _plain_colour(material, linear).astype(np.float32).reshape(1, 1, 3)
     try:
+        if image.mode.startswith("I"):  # 16 bits of grey, which PIL would cut off at 255
+            image = Image.fromarray((np.asarray(image, np.float32) / 257.0).round().astype(np.uint8))
         rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255.0)
     except OSError as error:
         raise MeshError(f"cannot read a texture of {path} ({error}); export it again") from error

@@ -148,9 +148,14 @@ def _placed_by_images(
     facts: dict[str, Any] = {}
     if (report := (images if images.is_dir() else images.parent) / REPORT_FILE).is_file():
         facts = read_json(report)
-    if facts.get("scale_from", "poses") is None:
+    if facts.get("scale_from") is None:
+        got = (
+            "one of unknown scale"
+            if facts
+            else f"one without {REPORT_FILE}, which says how its metres are known"
+        )
         raise ImportRecordingError(
-            f"expected a data set in metres at {images}, got one of unknown scale; make it with --length, --positions or --marker"
+            f"expected a data set in metres at {images}, got {got}; make it with advnerf scene from-scan and --length, --positions or --marker"
         )
     if "T_world_from_scan" in facts:
         frames.insert(

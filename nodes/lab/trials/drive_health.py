@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -38,8 +37,9 @@ class DriveHealth:
         stopped: Why the safety node disarmed; empty for a complete drive.
         ticks: Control ticks of the drive.
         unserved: Control ticks without a new command at the motor.
-        late: Control ticks whose command was late.
+        late: Commands that were late.
         loops: Share of ticks that the loop of each node missed.
+        commands: Commands of the drive, as many as its images; None counts one for each tick.
         pictures: Pictures that a simulated camera skipped, because it was still drawing an earlier one; up to the end of the bag.
     """
 
@@ -49,6 +49,7 @@ class DriveHealth:
     late: int = 0
     loops: Mapping[str, float] = field(default_factory=dict)
     pictures: int = 0
+    commands: int | None = None
 
 
 def spoiled_by(health: DriveHealth) -> str:
@@ -58,8 +59,9 @@ def spoiled_by(health: DriveHealth) -> str:
     most = max(1, int(_TICK_SHARE * health.ticks))
     if health.unserved > most:
         return f"{health.unserved} of {health.ticks} control ticks had no new command; at most {most} may"
-    if health.late > most:
-        return f"{health.late} of {health.ticks} commands were older than {_LATE_S:g} s; at most {most} may"
+    commands = health.ticks if health.commands is None else health.commands
+    if health.late > (most := max(1, int(_TICK_SHARE * commands))):
+        return f"{health.late} of {commands} commands were older than {_LATE_S:g} s; at most {most} may"
     for node, share in sorted(health.loops.items()):
         if share > _LOOP_SHARE:
             return f"node {node} missed {100 * share:.0f} % of its ticks; at most {100 * _LOOP_SHARE:.0f} % may be missed"
@@ -88,7 +90,9 @@ def read_health(
     last_ns = end_real_ns - round(tick_s * NS_PER_S)
     ticks = max(0, int((last_ns - start_real_ns) / NS_PER_S / tick_s + 1e-6))
     recorded = {topic.name for topic in read_info(bag).topics}
-    ages_s = _command_ages_s(bag, start_real_ns, last_ns) if SENT in recorded else np.zeros(0)
+    ages_ns = command_ages_ns(bag) if SENT in recorded else {}
+    served = sorted(at for at in ages_ns if start_real_ns <= at < last_ns)
+    ages_s = np.array([ages_ns[at] / NS_PER_S for at in served])
     reports = {
         name.removeprefix(STATUS_PREFIX): _counters(bag, name, start_real_ns)
         for name in sorted(recorded)
@@ -105,12 +109,17 @@ def read_health(
         int(_rise([values for _, values in counters], _MISSED_PICTURES)) for counters in reports.values()
     )
     late = int(np.count_nonzero(ages_s > _LATE_S))
-    return DriveHealth(stopped, ticks, max(0, ticks - len(ages_s)), late, loops, pictures)
+    unserved = _unserved(served, start_real_ns, last_ns, round(tick_s * NS_PER_S))
+    return DriveHealth(stopped, ticks, min(ticks, unserved), late, loops, pictures, len(served))
 
 
-def _command_ages_s(bag: Path, start_ns: int, end_ns: int) -> Any:
-    """Time from capture to the first serial write of every image of the drive that became a command ``[n]`` [s]."""
-    return np.array([age / NS_PER_S for at, age in command_ages_ns(bag).items() if start_ns <= at < end_ns])
+def _unserved(served_ns: Sequence[int], start_ns: int, end_ns: int, tick_ns: int) -> int:
+    """Ticks without a new command, from the gaps between the images that became one: a faster camera does not make up for a pause."""
+    if not served_ns:
+        return (end_ns - start_ns) // tick_ns
+    gaps = np.diff(served_ns)
+    edges = (served_ns[0] - start_ns) // tick_ns + (end_ns - 1 - served_ns[-1]) // tick_ns
+    return int(edges + np.maximum(np.rint(gaps / tick_ns) - 1.0, 0.0).sum())
 
 
 def _counters(bag: Path, topic: str, start_ns: int) -> list[tuple[int, dict[str, float]]]:

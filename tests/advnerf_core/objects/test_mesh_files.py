@@ -338,3 +338,87 @@ def test_voxels_that_lose_the_object_are_refused_or_told():
     fine = build_from_mesh(bottle(), "bottle", 32, 0).about
     assert (fine["missing"] < THIN, advice(fine)) == (True, [])
     assert fine["held_out_object_psnr_db"] < fine["held_out_psnr_db"] - 5.0
+
+
+def accessors(**change):
+    """Those of `gltf`, the second, of texture coordinates, with a change."""
+    place = {
+        "bufferView": 0,
+        "componentType": 5126,
+        "count": 3,
+        "type": "VEC3",
+        "min": [0, 0, 0],
+        "max": [1, 2, 0],
+    }
+    return [place, {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2", **change}]
+
+
+@pytest.mark.parametrize(
+    ("header", "got"),
+    [
+        ({"nodes": [{"mesh": 0, "skin": 0, "scale": [0.1, 0.1, 0.1]}]}, "a skin, whose bones place"),
+        ({"nodes": [{"mesh": 0, "weights": [1.0]}]}, "weights of morph targets"),
+        ({"accessors": accessors(sparse={"count": 1})}, "sparse accessors"),
+        (
+            {"accessors": accessors(componentType=5123, normalized=True)},
+            "texture coordinates as whole numbers",
+        ),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 6}]}]}, "triangle fans"),
+    ],
+)
+def test_geometry_of_gltf_that_the_reader_leaves_out_is_refused(tmp_path, header, got):
+    """Each had been read as another shape, or with other colours, without a word."""
+    with pytest.raises(MeshError, match=rf"expected plain triangles in .*, got {got}"):
+        load_mesh(gltf(tmp_path / "a.gltf", pbr(), **header))
+    weightless = {"nodes": [{"mesh": 0, "weights": [0.0]}], "accessors": accessors()}
+    assert load_mesh(gltf(tmp_path / "b.gltf", pbr(), **weightless)).size_m.max() == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("wrap", [33071, 33648])
+def test_an_image_that_ends_at_its_edge_needs_coordinates_within(tmp_path, wrap):
+    (tmp_path / "a.png").write_bytes(png())
+    file = gltf(tmp_path / "a.gltf", pbr(**TEXTURED), "a.png")
+    content = json.loads(file.read_text())
+    content |= {"samplers": [{"wrapS": wrap}], "textures": [{"source": 0, "sampler": 0}]}
+    file.write_text(json.dumps(content))
+    assert load_mesh(file).parts[0].texture.shape == (4, 4, 3)
+    body = TRIANGLE.tobytes() + (2.0 * UV - 0.5).astype("<f4").tobytes()
+    content["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
+    file.write_text(json.dumps(content))
+    with pytest.raises(MeshError, match=r"texture coordinates within 0\.\.1 in .* clamped or mirrored"):
+        load_mesh(file)
+    content["samplers"] = [{"wrapS": 10497}]
+    file.write_text(json.dumps(content))
+    assert load_mesh(file).parts[0].uv.min() == pytest.approx(-0.5)
+
+
+@pytest.mark.parametrize("lines", ["mtllib a.mtl\nmtllib b.mtl", "mtllib a.mtl b.mtl"])
+def test_two_libraries_of_materials_are_refused(tmp_path, lines):
+    """Of two, one was read, and parts with materials of the other were grey."""
+    path = obj(tmp_path, material="")
+    (tmp_path / "b.mtl").write_text("newmtl n\nKd 0 1 0\n")
+    path.write_text(path.read_text().replace("mtllib a.mtl", lines))
+    with pytest.raises(
+        MeshError, match=r"expected one library of materials \(mtllib\), got a\.mtl, b\.mtl; join them"
+    ):
+        load_mesh(path, unit="m")
+
+
+def test_a_texture_of_16_bits_of_grey_is_not_cut_off(tmp_path):
+    path = obj(tmp_path)
+    grey = np.array([[65535, 32768], [16384, 0]], np.uint16)
+    Image.fromarray(grey).save(tmp_path / "my texture.png")
+    texture = load_mesh(path, unit="m").parts[0].texture
+    np.testing.assert_allclose(texture[..., 0], grey / 65535.0, atol=0.5 / 255.0)
+
+
+@pytest.mark.parametrize("kind", ["ushort red", "uchar diffuse_red"])
+def test_colours_of_a_ply_that_the_reader_takes_for_others_are_refused(tmp_path, kind):
+    rest = [kind.replace("red", name) for name in ("red", "green", "blue")]
+    properties = "".join(f"property {each}\n" for each in ("float x", "float y", "float z", *rest))
+    (tmp_path / "a.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 3\n{properties}element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0 9 9 9\n1 0 0 9 9 9\n0 0 2 9 9 9\n3 0 1 2\n"
+    )
+    with pytest.raises(MeshError, match=rf"as uchar or float properties red, green and blue, got {kind}"):
+        load_mesh(tmp_path / "a.ply", unit="m")

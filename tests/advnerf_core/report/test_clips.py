@@ -77,6 +77,13 @@ def test_a_video_is_h264_of_even_size_and_appears_when_it_is_complete(tmp_path):
         assert container.streams.video[0].codec_context.name == "h264"
     assert np.abs(clips.read_clip(path).astype(float) - frames[:, :40]).max() < 8
 
+    # Of a control period that is no whole number of frames a second.
+    for rate_hz in (1.0 / 0.15, 2.5, 10.0 / 1.2):
+        with av.open(str(clips.write_video(tmp_path / "new" / "v.mp4", iter(frames), rate_hz))) as container:
+            stream = container.streams.video[0]
+            assert float(stream.average_rate) == pytest.approx(rate_hz, rel=1e-3)
+            assert float(stream.duration * stream.time_base) == pytest.approx(4.0 / rate_hz, rel=1e-3)
+
     def broken():
         yield frames[0]
         raise KeyboardInterrupt

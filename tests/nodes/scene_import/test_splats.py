@@ -100,7 +100,7 @@ def test_the_images_it_was_trained_on_place_a_splat(tmp_path, flipped):
 
 
 def test_images_that_it_does_not_show_are_refused(tmp_path):
-    images = data_set(tmp_path / "set", room(2000))
+    images = data_set(tmp_path / "set", room(2000), scale_from="length")
     other = write_ply(
         tmp_path / "a.ply",
         room(2000, colour=lambda points, face: np.random.default_rng(0).uniform(0, 1, points.shape) ** 4),
@@ -110,8 +110,12 @@ def test_images_that_it_does_not_show_are_refused(tmp_path):
     ):
         from_splat(other, tmp_path / "s", SplatOptions(images=images))
     unscaled = data_set(tmp_path / "unscaled", room(2000), scale_from=None)
-    with pytest.raises(ImportRecordingError, match="expected a data set in metres"):
+    with pytest.raises(ImportRecordingError, match=r"expected a data set in metres .* unknown scale"):
         from_splat(other, tmp_path / "s", SplatOptions(images=unscaled))
+    # As another program writes it: nothing says that its unit is the metre.
+    foreign = data_set(tmp_path / "foreign", room(2000))
+    with pytest.raises(ImportRecordingError, match=r"expected a data set in metres .* without import\.json"):
+        from_splat(other, tmp_path / "s", SplatOptions(images=foreign))
     assert not (tmp_path / "s").exists()
 
 
