@@ -79,7 +79,7 @@ class SafetyConfig(StrictModel):
 
     room: Path
     vehicle: Path
-    nodes: tuple[str, ...] = Field(default=("camera", "vicon", "compositor", "policy", "motor"), min_length=1)
+    nodes: tuple[str, ...] = ("camera", "vicon", "compositor", "policy", "motor")
     drivers: tuple[Literal["expert", "policy"], ...] = Field(default=("policy",), min_length=1)
     teleop: Literal["none", "hold"] = "none"
     teleop_age_limit_s: float = Field(default=0.2, gt=0.05, le=0.25)

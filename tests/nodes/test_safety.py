@@ -171,11 +171,6 @@ def test_safety_reads_its_fence_from_the_room_file(node_context):
     assert "/status/policy" not in node.subscriptions
 
 
-def test_safety_watches_at_least_one_node():
-    with pytest.raises(ValueError, match=r"nodes\n.*at least 1"):
-        SafetyConfig(room=TWIN / "room.yaml", vehicle=TWIN / "vehicle.yaml", nodes=())
-
-
 # Poses and stalls.
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 
+from advnerf_core.geometry import planar_pose
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import drive_message, header, image_message, pose_message, types
 from tests.support.messages import filled
@@ -36,6 +37,7 @@ class Car(threading.Thread):
         self.folder, self.stopping = folder, False
         self.newest, self.acts, self.moves, self.heard = {}, [], [], {}
         self.pictures = self.motor = self.compositor = True
+        self.x_m = self.goes_to_m = 0.0
 
     def run(self):
         heard = (
@@ -70,7 +72,8 @@ class Car(threading.Thread):
 
     def _say(self, bus, tick):
         now_ns = time.time_ns()
-        bus.publish("/vicon/car", pose_message(np.eye(4), now_ns))
+        self.x_m = min(self.x_m + 0.006, self.goes_to_m)  # 0.3 m/s
+        bus.publish("/vicon/car", pose_message(planar_pose(self.x_m, 0.0, 0.0), now_ns))
         bus.publish("/policy/drive", drive_message(0.5, 0.0, now_ns))
         if self.motor and self.moves:
             bus.publish("/motor/sent", motor_sent(self.moves[-1][1], now_ns))
