@@ -218,13 +218,15 @@ class Student:
         return float((sum(last) / len(last)) ** 0.5)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Weights, moments and lessons."""
+        """Weights, buffers, moments and lessons."""
         kept = {"images": self.lessons.images, "goals": self.lessons.goals, "answers": self.lessons.answers}
         kept["bound_rad"] = torch.tensor(self.bound_rad, dtype=torch.float64)
         for name, value in self.network.named_parameters():
             kept[f"weight.{name}"] = value.detach().clone()
             for key, moment in self._adam.moments[name].items():
                 kept[f"{key}.{name}"] = moment.clone()
+        for name, buffer in self.network.named_buffers():
+            kept[f"buffer.{name}"] = buffer.detach().clone()
         return {f"student.{key}": value.contiguous() for key, value in kept.items()}
 
     @classmethod
@@ -244,6 +246,8 @@ class Student:
             with torch.no_grad():
                 value.copy_(kept[f"weight.{name}"])
             moments[name] = {key: kept[f"{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq")}
+        for name, buffer in student.network.named_buffers():
+            buffer.copy_(kept[f"buffer.{name}"])
         student._adam = Adam(weights, moments)
         student.network.requires_grad_(False)
         return student

@@ -327,3 +327,26 @@ def test_an_onnx_policy_refuses_gradients_and_is_attacked_all_the_same(tmp_path)
     result = black_box_attack(problem, search, least_calls(search, problem, 3))
     assert len(result.history) == 3
     assert result.history[0].total_cte_m != result.history[2].total_cte_m
+
+
+class Normalised(nn.Module):
+    """A student with running statistics, which are no parameters."""
+
+    def __init__(self):
+        super().__init__()
+        self.scale, self.out = nn.BatchNorm2d(3), nn.Linear(3, 1)
+
+    def forward(self, images, goals=None):
+        return self.out(self.scale(images).mean((2, 3)))[:, 0]
+
+
+def test_a_student_comes_back_with_its_buffers():
+    """A search that was stopped had gone on with a student that steers otherwise."""
+    generator = torch.Generator().manual_seed(0)
+    images = (torch.rand(16, 2, *SHAPE, generator=generator) * 255).to(torch.uint8)
+    lessons = Lessons(images, torch.zeros(16, 0), torch.randn(16, 2, generator=generator))
+    student = Student(lessons, Distillation(), 0, lambda *shape: Normalised())
+    student.learn(10, generator)
+    again = Student.from_tensors(student.tensors(), Distillation(), lambda *shape: Normalised())
+    seen = torch.rand(4, *SHAPE, generator=generator)
+    assert torch.equal(again(seen), student(seen))
