@@ -159,7 +159,12 @@ def test_a_silent_controller_is_braked_over_the_line_that_is_still_open(make):
     drive(car, 0.5)
     car.emulator.disturb("silent")
     since = CLOCK.now().mono_ns
-    car.settle(lambda: car.node.status()[0] == "fault")
+
+    def has_failed():
+        drive(car, 0.5)  # else the node may stop for a lack of commands first
+        return car.node.status()[0] == "fault"
+
+    car.settle(has_failed)
     car.settle(lambda: any(e.name == "SET_CURRENT_BRAKE" for e in car.emulator.events(since)))
     car.emulator.disturb(None)
     car.settle(lambda: "link fault" in car.node.status()[1] and car.node.status()[1].startswith("latched"))

@@ -72,7 +72,8 @@ class Car(threading.Thread):
 
     def _say(self, bus, tick):
         now_ns = time.time_ns()
-        self.x_m = min(self.x_m + 0.006, self.goes_to_m)  # 0.3 m/s
+        if self.armed and self.moves and self.moves[-1][1] > 0.0:
+            self.x_m = min(self.x_m + 0.006, self.goes_to_m)  # 0.3 m/s
         bus.publish("/vicon/car", pose_message(planar_pose(self.x_m, 0.0, 0.0), now_ns))
         bus.publish("/policy/drive", drive_message(0.5, 0.0, now_ns))
         if self.motor and self.moves:

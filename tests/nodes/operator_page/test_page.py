@@ -234,10 +234,10 @@ def test_a_trial_runs_from_the_first_motion_and_is_measured(tmp_path):
         ann = Browser(run.port)
         ann.take()
         assert ann.do("trial") == ""
+        ann.wait(lambda: ann.state["trial"]["phase"] == "waiting", "the trial to wait for the car")
+        run.car.goes_to_m = 0.012
         drive(run, ann)
         assert ann.do("trial") == "the car is armed; release the button first"
-        assert ann.state["trial"]["phase"] == "waiting"
-        run.car.goes_to_m = 0.012
         ann.wait(lambda: ann.state["trial"]["phase"] == "done", "the trial to end")
         run.wait(lambda: not run.car.armed, "the end of the trial to let go")
         trial = ann.state["trial"]
