@@ -266,20 +266,22 @@ class Vesc:
     def _write(self, data: bytes) -> None:
         if self._serial is None:
             raise LinkLost(f"expected an open port, but {self.port} is closed; call open() first")
-        deadline = time.monotonic() + self._write_timeout_s
-        left = data
         try:
-            # pyserial's own write takes a process that was held up for a blocked port, though all bytes were accepted.
-            while left := left[_accepted(self._serial.fileno(), left) :]:
-                wait_s = deadline - time.monotonic()
-                if wait_s <= 0.0 or not select.select([], [self._serial.fileno()], [], wait_s)[1]:
-                    raise LinkTimeout(
-                        f"expected {self.port} to take {len(data)} bytes, but it is blocked; the VESC hangs. Restart it"
-                    )
+            self._put(self._serial.fileno(), data)
         except LinkTimeout:
             raise
         except OSError as error:
             raise LinkLost(f"lost the VESC at {self.port} ({error}); check the USB cable") from error
+
+    def _put(self, fd: int, data: bytes) -> None:
+        """Write to the port. pyserial's own write takes a process that was held up for a blocked port, though all bytes were accepted."""
+        deadline, left = time.monotonic() + self._write_timeout_s, data
+        while left := left[_accepted(fd, left) :]:
+            wait_s = deadline - time.monotonic()
+            if wait_s <= 0.0 or not select.select([], [fd], [], wait_s)[1]:
+                raise LinkTimeout(
+                    f"expected {self.port} to take {len(data)} bytes, but it is blocked; the VESC hangs. Restart it"
+                )
 
     def _sent(self, erpm: float | None = None, brake_current_a: float | None = None) -> Sent:
         return Sent(

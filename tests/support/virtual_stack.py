@@ -49,6 +49,9 @@ class _Wire:
         self._replies += replies
         self._stack.events += events
 
+    def fileno(self) -> int:
+        return -1
+
     def read(self, count: int) -> bytes:
         data, self._replies = self._replies[:count], self._replies[count:]
         return data
@@ -63,7 +66,10 @@ class _WiredVesc(Vesc):
     stack: VirtualStack
 
     def open(self) -> None:
-        self._serial = _Wire(self.stack)  # type: ignore[assignment]
+        self._serial = self._wire = _Wire(self.stack)  # type: ignore[assignment]
+
+    def _put(self, fd: int, data: bytes) -> None:
+        self._wire.write(data)
 
 
 class VirtualStack:
