@@ -171,10 +171,9 @@ def fit_display(
         raise DegenerateDataError(
             f"expected one seen for every shown colour, got {seen.shape} and {shown.shape}"
         )
-    if not ((angles > 0.0) & (angles <= 1.0)).all():
-        wrong = float(angles[~((angles > 0.0) & (angles <= 1.0))][0])
+    if (wrong := angles[~((angles > 0.0) & (angles <= 1.0))]).size:
         raise DegenerateDataError(
-            f"expected a cos_angle above 0 and up to 1, of a camera before the screen, got {wrong:g}; if it is an angle, write its cosine"
+            f"expected a cos_angle above 0 and up to 1, of a camera before the screen, got {wrong[0]:g}; if it is an angle, write its cosine"
         )
     require_count(
         len(shown), _MIN_COLOURS, "colours", "show the whole sequence: ramps, primaries, mixed colours"

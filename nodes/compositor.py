@@ -29,7 +29,7 @@ from nodes.control.interlock import ATTACK_SWITCH, SAFETY_STATE, AttackSwitch, I
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
-from nodes.runtime.messages import header, image_message, pose_matrix, stamp_ns, types
+from nodes.runtime.messages import finite_pose, header, image_message, stamp_ns, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.pictures import rgb8_message, rgb_image
 from nodes.runtime.process import run_node_main
@@ -208,11 +208,7 @@ class CompositorNode(Node):
 
     def _take_pose(self, topic: str, message: Any, now: Now) -> list[Out]:
         """Note a pose. One that is none is as good as a lost one: the image is dropped, not passed on as if the face were out of view."""
-        try:
-            T = pose_matrix(message)
-        except MessageError:
-            T = np.full((4, 4), np.nan)
-        if not np.isfinite(T).all():
+        if (T := finite_pose(message)) is None:
             self._counts["bad_poses"] += 1
             return []
         self._poses[topic].add(stamp_ns(message), T)

@@ -22,8 +22,7 @@ from advnerf_core.geometry import wrap_angle, yaw_of
 from advnerf_core.strict import StrictModel
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.errors import MessageError
-from nodes.runtime.messages import drive_message, header, pose_matrix, stamp_ns, types
+from nodes.runtime.messages import drive_message, finite_pose, header, stamp_ns, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
 
@@ -154,11 +153,9 @@ class ExpertNode(Node):
             self._armed_ns = info.publish_mono_ns if message.armed else None
             return []
         capture_ns = stamp_ns(message)
-        try:
-            T = pose_matrix(message)
-        except MessageError:
-            T = np.full((4, 4), np.nan)
-        if not np.isfinite(T).all() or now.real_ns - capture_ns > self._config.max_age_s * NS_PER_S:
+        if (
+            T := finite_pose(message)
+        ) is None or now.real_ns - capture_ns > self._config.max_age_s * NS_PER_S:
             self._stale += 1
             return []
         x_m, y_m, yaw_rad = float(T[0, 3]), float(T[1, 3]), yaw_of(T)

@@ -359,26 +359,19 @@ def _focal_length(values: _Values, axis: str, size: int) -> float | None:
     Raises:
         ValueError: It is no number, or another form says another one: it is in pixels of another size, or of another lens.
     """
-    said = {
-        key: focal
-        for keys in _FOCAL_FORMS
-        for key in keys
-        if key in (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov")
-        if (focal := _focal_length_of(values, key, size)) is not None
-    }
-    for key, focal in list(said.items())[1:]:
-        first = next(iter(said))
+    keys = [form["xy".index(axis)] for form in _FOCAL_FORMS]
+    said = {key: _focal_length_of(values, key, size) for key in keys if values.get(key) is not None}
+    first = next(iter(said), "")
+    for key, focal in said.items():
         if not math.isclose(focal, said[first], rel_tol=_SAME_LENS):
             raise ValueError(
                 f"{first}: expected the lens that {key} = {values[key]!r:.40} says, {focal:.6g} pixels in an image of {size}, got "
                 f"{values[first]!r:.40}; correct w and h if they are not of these images, or take the wrong one out"
             )
-    return next(iter(said.values()), None)
+    return said.get(first)
 
 
-def _focal_length_of(values: _Values, key: str, size: int) -> float | None:
-    if values.get(key) is None:
-        return None
+def _focal_length_of(values: _Values, key: str, size: int) -> float:
     value = _number(values, key, 0.0, positive=True)
     if key in ("fl_x", "fl_y"):
         return value

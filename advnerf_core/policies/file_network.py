@@ -63,8 +63,7 @@ class FileNetwork(ABC):
                 f"expected the file to take {[list(each.shape) for each in feeds.values()]}, but it wants "
                 f"{', '.join(map(str, self.tensors.inputs))}; correct size and layout in the declaration ({reason:.120})"
             ) from error
-        if (
-            self.tensors.one_by_one and raw.ndim == 0
-        ):  # squeezed to one number, which can only be this image's
+        # Squeezed to one number, which can only be this image's.
+        if self.tensors.one_by_one and raw.ndim == 0:
             raw = raw.reshape(1)
         return (raw, joined(states, dict(zip(names[1:], following, strict=True)))) if states else raw

@@ -12,8 +12,7 @@ from hardware.motor.vesc_settings import AppConfiguration, TimeoutSettings
 from nodes.control.motor_reports import ControllerReport, odometry_message
 from nodes.control.steering_check import CheckSettings, SteeringCheck
 from nodes.runtime.clock import NS_PER_S, Now
-from nodes.runtime.errors import MessageError
-from nodes.runtime.messages import pose_matrix
+from nodes.runtime.messages import finite_pose
 from nodes.runtime.node import Out
 from nodes.runtime.requests import Answer, AnswerMemory
 from nodes.runtime.twin_port import is_twin, peer_text
@@ -116,11 +115,8 @@ class ControllerWatch:
         """Note a pose of the car during the steering check."""
         if not self.check.showing:
             return
-        try:
-            T = pose_matrix(message)
-        except MessageError:
-            return  # no measurement
-        self.check.pose(float(T[0, 3]), float(T[1, 3]), yaw_of(T), mono_ns)
+        if (T := finite_pose(message)) is not None:
+            self.check.pose(float(T[0, 3]), float(T[1, 3]), yaw_of(T), mono_ns)
 
     @property
     def steering_good(self) -> bool:

@@ -14,8 +14,7 @@ from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import yaw_of
 from calibration.schema import RoomCalibration
 from nodes.runtime.clock import NS_PER_S, Now
-from nodes.runtime.errors import MessageError
-from nodes.runtime.messages import pose_matrix, stamp_ns
+from nodes.runtime.messages import finite_pose, stamp_ns
 from nodes.runtime.topics import STATUS_PREFIX
 from nodes.runtime.wire import MessageInfo
 
@@ -154,13 +153,9 @@ class ViewState:
         return round(max(0.0, (now.mono_ns - self._newest[topic][1]) / NS_PER_S), 2)
 
     def _move(self, message: Any) -> None:
-        try:
-            T = pose_matrix(message)
-        except MessageError:
+        if (T := finite_pose(message)) is None:
             return  # an occluded subject; the age of the pose on the page grows
         x_m, y_m = float(T[0, 3]), float(T[1, 3])
-        if not (math.isfinite(x_m) and math.isfinite(y_m)):
-            return
         self._position_m, self._yaw_rad = (x_m, y_m), yaw_of(T)
         if not self._trail or math.dist(self._trail[-1], (x_m, y_m)) >= _TRAIL_STEP_M:
             self._trail.append((x_m, y_m))

@@ -175,6 +175,15 @@ def pose_matrix(message: Any) -> NDArray[np.float64]:
     return make_transform(rotation, np.array([position.x, position.y, position.z]))
 
 
+def finite_pose(message: Any) -> NDArray[np.float64] | None:
+    """Convert a ``PoseStamped`` to a transform ``[4, 4]``; None for one that is no pose: with a number that is not finite, or no orientation."""
+    try:
+        T = pose_matrix(message)
+    except MessageError:
+        return None
+    return T if np.isfinite(T).all() else None
+
+
 def drive_message(speed_mps: float, steering_rad: float, stamp_ns: int, frame_id: str = "car") -> Any:
     """Make an ``AckermannDriveStamped``. ``stamp_ns`` is the capture time of the image that the command is based on."""
     drive = types.AckermannDrive(

@@ -72,10 +72,10 @@ def room_of(given: Path | None, logs: Sequence[OpenLog]) -> RoomCalibration | No
 def policy_view(camera: Path | None, logs: Sequence[OpenLog]) -> PolicyView:
     """The policy's view: of the camera's calibration if there is one, or else for the size of the first log's images."""
     if camera is not None:
-        attached = [load_calibration(CameraCalibration, camera)]
+        calibration: CameraCalibration | None = load_calibration(CameraCalibration, camera)
     else:
-        attached = list(attached_calibrations(CameraCalibration, logs, "camera").values())
-    for calibration in attached[:1]:
+        calibration = next(iter(attached_calibrations(CameraCalibration, logs, "camera").values()), None)
+    if calibration is not None:
         return view_for_camera(calibration.pinhole, calibration.distortion)
     height, width = logs[0].log.first_image().shape[:2]
     return view_for_size(width, height)

@@ -18,8 +18,8 @@ from advnerf_core.driving.metrics import MOVED_M
 from advnerf_core.geometry import planar_pose, wrap_angle, yaw_of
 from nodes.runtime.arm_requests import BRAKE_WAIT_S, arm_message
 from nodes.runtime.clock import NS_PER_S, Now
-from nodes.runtime.errors import MessageError, NodeFinished, RuntimeFault
-from nodes.runtime.messages import ns_from_stamp, pose_matrix, pose_message
+from nodes.runtime.errors import NodeFinished, RuntimeFault
+from nodes.runtime.messages import finite_pose, ns_from_stamp, pose_message
 from nodes.runtime.node import MessageInfo, Node, Out
 from nodes.runtime.requests import RequestIdentity
 from nodes.runtime.topics import status_topic
@@ -168,10 +168,9 @@ class TrialNode(Node):
         return "active", self.phase.value
 
     def _see_car(self, message: Any, now: Now) -> None:
-        try:
-            T, stamp_ns = pose_matrix(message), ns_from_stamp(message.header.stamp)
-        except MessageError:
-            return  # not a pose: as if none had come
+        if (T := finite_pose(message)) is None:
+            return  # as if none had come
+        stamp_ns = ns_from_stamp(message.header.stamp)
         seen = self._seen
         # Speed from consecutive poses would be noise. The car stands if it has not left a spot for some time.
         if seen.spot_m is None or float(np.linalg.norm(T[:3, 3] - seen.spot_m)) > _SPOT_M:
