@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +19,35 @@ def refuse_unread(header: _Entry, path: Path) -> None:
     Raises:
         MeshError: The mesh is skinned or morphed, has sparse accessors, triangle fans, or texture coordinates as whole numbers.
     """
-    if found := "; ".join(dict.fromkeys(_unread(header))):
+    with _well_formed(path):
+        found = "; ".join(dict.fromkeys(_unread(header)))
+    if found:
         raise MeshError(f"expected plain triangles in {path}, got {found}; export it again")
 
 
-def has_an_end(header: _Entry) -> bool:
-    """Whether some colour texture does not repeat beyond its edges."""
+def has_an_end(header: _Entry, path: Path) -> bool:
+    """Whether some texture does not repeat beyond its edges.
+
+    Raises:
+        MeshError: A texture names a sampler that is not there.
+    """
     samplers = header.get("samplers", [])
-    return any(
-        samplers[texture["sampler"]].get(wrap, _REPEAT) != _REPEAT
-        for texture in header.get("textures", [])
-        if "sampler" in texture
-        for wrap in ("wrapS", "wrapT")
-    )
+    with _well_formed(path):
+        return any(
+            samplers[texture["sampler"]].get(wrap, _REPEAT) != _REPEAT
+            for texture in header.get("textures", [])
+            if "sampler" in texture
+            for wrap in ("wrapS", "wrapT")
+        )
+
+
+@contextmanager
+def _well_formed(path: Path) -> Iterator[None]:
+    """Say of a header whose entries are of another kind, or not there, that the file cannot be read."""
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        raise MeshError(f"cannot read {path} as a mesh (glTF: {error!r}); export it again") from error
 
 
 def _unread(header: _Entry) -> Iterator[str]:

@@ -63,7 +63,7 @@ def load_mesh(
             f"expected a mesh with triangles in {path}, got none: is it a point cloud or an empty scene?"
         )
     gltf = path.suffix.lower() in _GLTF
-    if gltf and has_an_end(_gltf_header(path, files.content)):
+    if gltf and has_an_end(_gltf_header(path, files.content), path):
         _require_inside(parts, path)
     mesh = stand(SurfaceMesh(tuple(parts)), up or ("y" if gltf else "z"), height_m, str(path))
     if height_m is None:
@@ -187,10 +187,7 @@ def _read_named_by_gltf(path: Path, content: bytes, read: _Read) -> None:
         raise MeshError(
             f"expected a mesh without the glTF extension {', '.join({*required, *used})}, got {path}; export it again without it"
         )
-    try:
-        refuse_unread(header, path)
-    except (AttributeError, IndexError, KeyError, TypeError) as error:
-        raise MeshError(f"cannot read {path} as a mesh (glTF: {error!r}); export it again") from error
+    refuse_unread(header, path)
     for material in header.get("materials", []):
         texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
         if texture.get("texCoord", 0) != 0:

@@ -422,3 +422,18 @@ def test_colours_of_a_ply_that_the_reader_takes_for_others_are_refused(tmp_path,
     )
     with pytest.raises(MeshError, match=rf"as uchar or float properties red, green and blue, got {kind}"):
         load_mesh(tmp_path / "a.ply", unit="m")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"textures": [{"source": 0, "sampler": 7}]},
+        {"samplers": [3], "textures": [{"source": 0, "sampler": 0}]},
+    ],
+)
+def test_a_sampler_that_is_none_is_one_error(tmp_path, change):
+    (tmp_path / "a.png").write_bytes(png())
+    file = gltf(tmp_path / "a.gltf", pbr(**TEXTURED), "a.png")
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(MeshError, match=r"cannot read .*a\.gltf as a mesh \(glTF: "):
+        load_mesh(file)
