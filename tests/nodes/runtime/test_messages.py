@@ -14,6 +14,7 @@ from nodes.runtime.messages import (
     decode,
     drive_message,
     encode,
+    finite_pose,
     header,
     image_message,
     pose_matrix,
@@ -83,6 +84,20 @@ def test_pose_without_orientation_is_refused():
     message.pose.orientation.w = 0.0
     with pytest.raises(MessageError, match="expected a pose with an orientation"):
         pose_matrix(message)
+
+
+@pytest.mark.parametrize("field", ["position.z", "orientation.w", "orientation"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_pose_with_a_number_that_is_none_or_without_orientation_is_no_pose(field, value):
+    message = pose_message(make_transform(rotation_z(0.3), [1.0, 2.0, 0.0]), 0)
+    np.testing.assert_array_equal(finite_pose(message), pose_matrix(message))
+    o = message.pose.orientation
+    if field == "orientation":
+        o.x = o.y = o.z = o.w = 0.0
+    else:
+        part, name = field.split(".")
+        setattr(getattr(message.pose, part), name, value)
+    assert finite_pose(message) is None
 
 
 def test_camera_info_has_the_principal_point_of_ros_and_comes_back_as_ours():
