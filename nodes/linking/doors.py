@@ -72,7 +72,11 @@ class Doorkeeper:
             self._log.refuse(f"{address} at the {right} door: expected a CURVE key, got {frames[5]!r}")
             return ""
         public = z85.encode(frames[6]).decode("ascii")
-        user = self._keys.allowed(right).get(public, "")
+        try:
+            user = self._keys.allowed(right).get(public, "")
+        except OSError as error:
+            self._log.refuse(f"{address} at the {right} door: the list cannot be read: {error.strerror}")
+            return ""
         if user:
             self._allowed[right][public] = user
         else:
@@ -80,10 +84,16 @@ class Doorkeeper:
         return user
 
     def revoked(self) -> dict[str, list[str]]:
-        """Names removed from a list since the last call, by list."""
+        """Names removed from a list since the last call, by list. Nobody, while descriptors or memory have run out."""
         gone = {}
         for right, before in self._allowed.items():
-            now = self._keys.allowed(right)
+            try:
+                now = self._keys.allowed(right)
+            except OSError as error:
+                self._log.say(
+                    f"the list of those who may {right} cannot be read, and stays: {error.strerror}"
+                )
+                continue
             if names := [name for key, name in before.items() if key not in now]:
                 gone[right] = names
             self._allowed[right] = now

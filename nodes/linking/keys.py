@@ -7,11 +7,12 @@ lists at every handshake and twice a second, and disconnects keys that were remo
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import os
 import re
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ import zmq
 
 from advnerf_core.files import write_atomically
 from advnerf_core.places import expanded, private_folder, user_place
+from nodes.runtime.descriptors import has_run_out
 from nodes.runtime.errors import SecurityError
 
 WATCH, DRIVE = "watch", "drive"
@@ -147,13 +149,18 @@ class KeyFolder:
         return _read_key(file)
 
     def allowed(self, right: str) -> dict[str, str]:
-        """Names of a list by public key. A file without a valid key is ignored."""
-        found = {}
-        for file in sorted((self.path / right).glob("*.pub")):
-            try:
-                found[_read_key(file)] = file.stem
-            except (SecurityError, FileNotFoundError):
-                continue
+        """Names of a list by public key. What cannot be read, or has no valid key, allows nobody.
+
+        Raises:
+            OSError: Descriptors or memory have run out, so that the list is not known now; see `has_run_out`.
+        """
+        found: dict[str, str] = {}
+        with _ignoring_what_is_no_key():
+            for name in sorted(os.listdir(self.path / right)):
+                file = self.path / right / name
+                if file.suffix == ".pub":
+                    with _ignoring_what_is_no_key():
+                        found[_read_key(file)] = file.stem
         return found
 
     def rows(self) -> list[KeyRow]:
@@ -227,6 +234,17 @@ def require_keys(address: str, keys: KeyFolder | None, commands: Sequence[str] =
             f"without keys a link can only be used to watch, but this one would carry {shown} to the listening host, so any process on "
             f"{address} could drive the car. {_MAKE_KEYS}; or run all nodes on one computer with --host all"
         )
+
+
+@contextlib.contextmanager
+def _ignoring_what_is_no_key() -> Iterator[None]:
+    try:
+        yield
+    except SecurityError:
+        return
+    except OSError as error:
+        if has_run_out(error):
+            raise
 
 
 def _require_right(right: str) -> None:

@@ -23,6 +23,7 @@ from nodes.linking.doors import Doorkeeper, RefusalLog
 from nodes.linking.keys import DRIVE, WATCH, require_keys
 from nodes.linking.sockets import CLOCK, LINK_QUEUE, MOST_BYTES, PULSE, Handshake, LinkConfig, LinkSockets
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.descriptors import has_run_out
 from nodes.runtime.errors import MessageError
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.messages import decode
@@ -236,16 +237,24 @@ class Link:
             self._log.say(
                 f"{', '.join(gone)} may no longer {right}; all connections of that door must authenticate again"
             )
-            self._doors.close(right)
-            self._doors.open(right)
+            self._reopen(right)
 
     def _knock_again(self, now: float) -> None:
         """Reconnect after a refusal. ZeroMQ itself does not retry, but the key may be allowed later."""
         for right, since in list(self._locked_out.items()):
             if now - since >= _KNOCK_S:
                 del self._locked_out[right]
-                self._doors.close(right)
-                self._doors.open(right)
+                self._reopen(right)
+
+    def _reopen(self, right: str) -> None:
+        self._doors.close(right)
+        try:
+            self._doors.open(right)
+        except (OSError, zmq.ZMQError) as error:
+            if not has_run_out(error):
+                raise
+            self._log.say(f"the {right} door cannot be opened now: {error.strerror}")
+            self._locked_out[right] = time.monotonic()
 
     def _note(self, event: Handshake) -> None:
         if event.refusal:

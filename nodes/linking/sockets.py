@@ -108,9 +108,21 @@ class LinkSockets:
         return self._sockets.get(self._out)
 
     def open(self, right: str) -> None:
-        """Open a door."""
+        """Open a door; after an error it is closed.
+
+        Raises:
+            BusError: Its port is taken.
+            OSError, zmq.ZMQError: Descriptors or memory have run out.
+        """
+        self._sockets[right] = self._context.socket(zmq.SUB if right == self._in else zmq.PUB)
+        try:
+            self._prepare(self._sockets[right], right)
+        except Exception:
+            self.close(right)
+            raise
+
+    def _prepare(self, socket: zmq.Socket[Any], right: str) -> None:
         config = self._config
-        socket = self._context.socket(zmq.SUB if right == self._in else zmq.PUB)
         socket.linger = 0
         socket.sndhwm = socket.rcvhwm = LINK_QUEUE
         socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
@@ -121,11 +133,10 @@ class LinkSockets:
         socket.setsockopt(zmq.IPV6, ":" in config.address)
         if config.keys is not None:
             self._arm_curve(socket, right)
-        monitor = socket.get_monitor_socket(
+        self._monitors[right] = socket.get_monitor_socket(
             zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | sum(_FAILURES)
         )
-        self._sockets[right], self._monitors[right] = socket, monitor
-        self._poller.register(monitor, zmq.POLLIN)
+        self._poller.register(self._monitors[right], zmq.POLLIN)
         if right == self._in:
             socket.subscribe(CLOCK)
             socket.subscribe(PULSE)
@@ -134,14 +145,16 @@ class LinkSockets:
         self._attach(socket, config.watch_port if right == WATCH else config.drive_port)
 
     def close(self, right: str) -> None:
-        """Close a door and disconnect its peers."""
-        socket, monitor = self._sockets.pop(right), self._monitors.pop(right)
-        self._poller.unregister(monitor)
-        if right == self._in:
-            self._poller.unregister(socket)
-        socket.disable_monitor()
-        monitor.close(linger=0)
-        socket.close(linger=0)
+        """Close a door, if it is open, and disconnect its peers."""
+        socket, monitor = self._sockets.pop(right, None), self._monitors.pop(right, None)
+        for each in (socket, monitor):
+            if each in self._poller:
+                self._poller.unregister(each)
+        if socket is not None and monitor is not None:
+            socket.disable_monitor()
+            monitor.close(linger=0)
+        if socket is not None:
+            socket.close(linger=0)
 
     def close_all(self) -> None:
         """Close all open doors."""

@@ -5,14 +5,23 @@ Source: libzmq 4.3.5, ``ipc_listener.cpp`` (accept) and ``epoll.cpp`` abort on E
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
+
+import zmq
 
 from nodes.runtime.errors import BusError
 
 # A ZeroMQ context with its first sockets and connections needs fewer.
 _NEEDED = 32
 _RESERVED = 32
+_RAN_OUT = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+
+
+def has_run_out(error: OSError | zmq.ZMQError) -> bool:
+    """Whether an operation failed because there is no descriptor or memory left, so that it may succeed later."""
+    return error.errno in _RAN_OUT
 
 
 def raise_limit() -> None:

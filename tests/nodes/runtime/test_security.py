@@ -1,4 +1,7 @@
+import contextlib
 import errno
+import os
+import resource
 import socket
 import stat
 import time
@@ -7,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
+from zmq.utils import z85
 
 from nodes.gateway import GatewayConfig, GatewayNode
 from nodes.linking.clock_offset import Exchange, OffsetFilter
@@ -255,6 +259,80 @@ def test_revocation_ends_a_running_connection(lab):
     wait_for(lambda: not drives(lab.run(0.8, act=hello(workstation))), "the end of the connection")
     lab.keys["robot"].allow("workstation", DRIVE)
     assert drives(lab.run(60.0, drives, hello(workstation)))
+
+
+@contextlib.contextmanager
+def no_descriptor_left():
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with open(os.devnull) as lowest:
+        limit = lowest.fileno()
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+def test_a_list_that_cannot_be_read_for_want_of_descriptors_ends_no_connection_and_admits_nobody(lab, capfd):
+    robot = lab.robot()
+    workstation = lab.workstation()
+    assert lab.run(60.0, drives, hello(workstation))
+    keeper = robot.node._link._keeper
+    key = z85.decode(lab.keys["robot"].public("workstation"))
+    with no_descriptor_left():
+        with pytest.raises(OSError, match="Too many open files"):
+            lab.keys["robot"].allowed(DRIVE)
+        capfd.readouterr()
+        said = []
+
+        def was_looked_for(got):
+            said.append(capfd.readouterr().err)
+            return "the list of those who may drive cannot be read, and stays" in "".join(said)
+
+        lab.run(60.0, was_looked_for, hello(workstation))
+        assert drives(lab.run(60.0, drives, hello(workstation)))
+        assert keeper._user([b"1.0", b"1", b"drive", b"127.0.0.1", b"", b"CURVE", key]) == ""
+    assert keeper._user([b"1.0", b"1", b"drive", b"127.0.0.1", b"", b"CURVE", key]) == "workstation"
+    lab.keys["robot"].revoke("workstation", DRIVE)
+    wait_for(lambda: not drives(lab.run(0.8, act=hello(workstation))), "the end of the connection")
+
+
+def test_a_door_that_cannot_be_opened_for_want_of_descriptors_is_opened_later(lab, capfd):
+    robot = lab.robot()
+    workstation = lab.workstation()
+    assert lab.run(60.0, drives, hello(workstation))
+    link, failed = robot.node._link, []
+    opened = link._context.socket
+
+    def one_failure(*kind):
+        if not failed:
+            failed.append(kind)
+            raise zmq.ZMQError(errno.EMFILE)
+        return opened(*kind)
+
+    link._context.socket = one_failure
+    lab.keys["robot"].revoke("workstation", DRIVE)
+    lab.run(60.0, lambda got: failed)
+    lab.keys["robot"].allow("workstation", DRIVE)
+    assert drives(lab.run(60.0, drives, hello(workstation)))
+    assert "the drive door cannot be opened now: Too many open files" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("damage", ["a folder", "no key", "gone", "a loop"])
+def test_what_is_no_key_allows_nobody(lab, damage):
+    keys = lab.keys["robot"]
+    file = keys.path / DRIVE / "workstation.pub"
+    file.unlink()
+    if damage == "a folder":
+        file.mkdir()
+    elif damage == "no key":
+        file.write_text("abc")
+    elif damage == "a loop":
+        file.symlink_to(file)
+    else:
+        file.parent.rmdir()
+    assert keys.allowed(DRIVE) == {}
+    assert set(keys.allowed(WATCH).values()) == {"visitor", "workstation"}
 
 
 class Stranger:
