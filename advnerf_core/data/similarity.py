@@ -52,6 +52,12 @@ class Similarity:
         moved[..., :3, 3] = self.points(poses[..., :3, 3])
         return moved
 
+    def after(self, first: Similarity) -> Similarity:
+        """The map that applies another one first: from its source world to this target's."""
+        turn = self.T_target_from_source[:3, :3] @ first.T_target_from_source[:3, :3]
+        shift = self.points(first.T_target_from_source[:3, 3])
+        return Similarity(self.scale * first.scale, make_transform(turn, shift))
+
 
 @dataclass(frozen=True, eq=False)
 class Alignment:

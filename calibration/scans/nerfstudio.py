@@ -1,7 +1,7 @@
 """Reads data sets of nerfstudio, Instant-NGP and blender as scans, so that they can be put upright and get metres.
 
-Format: https://docs.nerf.studio/quickstart/data_conventions.html. ``applied_transform`` took COLMAP's world to the file's; ``dataparser_transforms.json`` takes COLMAP's world to that
-of a trained model: ``scale * (transform x)``.
+Format: https://docs.nerf.studio/quickstart/data_conventions.html. ``applied_transform`` and then ``applied_scale`` took COLMAP's world to the file's; ``dataparser_transforms.json``
+takes COLMAP's world to that of a trained model: ``scale * (transform x)``, where ``scale`` contains ``applied_scale``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from advnerf_core.data.image_files import read_bytes
 from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.documents import read_json
-from advnerf_core.geometry import Array, invert_transform
+from advnerf_core.geometry import Array, invert_transform, make_transform
 from calibration.photo_model import LeftOut, Registered
 from calibration.scans.scan import (
     Picture,
@@ -97,9 +97,16 @@ def _points(folder: Path, content: dict[str, Any]) -> tuple[Array, dict[str, Any
 
 def _facts(folder: Path, content: dict[str, Any]) -> dict[str, Any]:
     """Relations to the worlds of COLMAP and of a trained model, from its coordinates to the file's."""
-    applied = content.get("applied_transform")
+    applied, size = content.get("applied_transform"), content.get("applied_scale", 1.0)
     T_file_from_colmap = np.eye(4) if applied is None else pose_of(applied, f"{folder}: applied_transform")
-    facts: dict[str, Any] = {} if applied is None else {"T_scan_from_colmap": T_file_from_colmap.tolist()}
+    file_per_colmap = _size(size, f"{folder}: applied_scale")
+    facts: dict[str, Any] = {}
+    if applied is not None or file_per_colmap != 1.0:
+        # The file's positions are scaled after they are moved.
+        facts["T_scan_from_colmap"] = make_transform(
+            T_file_from_colmap[:3, :3], file_per_colmap * T_file_from_colmap[:3, 3]
+        ).tolist()
+        facts["scan_units_per_colmap_unit"] = file_per_colmap
     file = folder / _DATAPARSER
     if file.is_file():
         values = read_json(file)
@@ -107,12 +114,17 @@ def _facts(folder: Path, content: dict[str, Any]) -> dict[str, Any]:
             raise ScanError(
                 f"{file}: expected the keys transform and scale; copy the file from the training's folder again"
             )
-        scale = number(values.get("scale"), f"{file}: scale")
-        if scale <= 0.0:
-            raise ScanError(f"{file}: scale: expected a number above 0, got {scale:g}; copy the file again")
+        scale = _size(values.get("scale"), f"{file}: scale")
         T_model_from_colmap = pose_of(values["transform"], f"{file}: transform")
         facts["T_scan_from_dataparser"] = (
             T_file_from_colmap @ invert_transform(T_model_from_colmap)
         ).tolist()
-        facts["scan_units_per_dataparser_unit"] = 1.0 / scale
+        facts["scan_units_per_dataparser_unit"] = file_per_colmap / scale
     return facts
+
+
+def _size(value: Any, where: str) -> float:
+    found = number(value, where)
+    if found <= 0.0:
+        raise ScanError(f"{where}: expected a number above 0, got {found:g}; copy the file again")
+    return found

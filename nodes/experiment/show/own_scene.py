@@ -23,12 +23,11 @@ from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
 from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh import stand
-from advnerf_core.objects.voxel.mesh_files import load_mesh
 from advnerf_core.objects.voxel.model import load_object
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import TargetCalibration, load_calibration
 from nodes.experiment.engine.artefact import hash_of
-from nodes.experiment.plan.object_kinds import BALL, CUBE, MADE_HERE_M
+from nodes.experiment.plan.object_kinds import BALL, CUBE, MADE_HERE_M, load_mesh_of
 from nodes.experiment.plan.placed import FLAT, FaceConfig, MeshConfig, PlacedObject
 from nodes.experiment.plan.space_config import MeshShapeConfig, MeshTextureConfig
 from nodes.experiment.show.context import Experiment
@@ -130,7 +129,7 @@ def _mesh(thing: PlacedObject, wanted: MeshConfig) -> tuple[MeshField, str]:
     elif thing.kind in MADE_HERE_M:
         surface = stand(GENERATORS[GENERATOR_OF[thing.kind]](), height_m=wanted.height_m)
     else:
-        surface = load_mesh(Path(thing.kind), wanted.up, wanted.height_m, wanted.unit)
+        surface = load_mesh_of(thing.kind, wanted.up, wanted.height_m, wanted.unit)
         for note in surface.notes:
             print(f"warning: {note}")
     field = MeshField(unwrapped(surface, wanted.texels), thing.T_world_from_object, thing.scale)

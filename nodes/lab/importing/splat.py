@@ -129,22 +129,26 @@ def _placed_by_hand(file: Path, options: SplatOptions) -> Similarity:
 def _placed_by_images(
     splats: GaussianSplats, images: Path, listed: PosedImages, behind: Point
 ) -> tuple[Similarity, float]:
-    """The similarity under which the splat shows the images best, and its median PSNR [dB].
-
-    Splats are trained in the frame of the scan or of the data set, and some tools turn y and z around.
-    """
-    chosen = [
-        listed.frames[k] for k in np.unique(np.linspace(0, len(listed.frames) - 1, _COMPARED).astype(int))
-    ]
-    views = []
-    for frame in chosen:
-        shown = frame.pinhole
-        views.append(
-            listed.with_frames([frame]).load(
-                (_COMPARED_PX, max(1, round(_COMPARED_PX * shown.height / shown.width)))
-            )
+    """The similarity under which the splat shows the images best, and its median PSNR [dB]. Some tools turn y and z around."""
+    frames = _frames(images)
+    views = _views(listed)
+    flips: list[Array] = [np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])]
+    found = []
+    for frame in frames:
+        for flip in flips:
+            similarity = frame.after(Similarity(1.0, flip))
+            found.append((_agreement_db(SplatRenderer(splats.moved(similarity), behind), views), similarity))
+    best_db, best = max(found, key=lambda pair: pair[0])
+    if best_db < _LEAST_PSNR_DB:
+        raise ImportRecordingError(
+            f"expected a splat that shows the images of {images}, got a PSNR of {best_db:.1f} dB to them at best (at least {_LEAST_PSNR_DB:g}); give the "
+            "images that it was trained on, in the frame it was trained in, or place it with --metres-per-unit, --up and --origin"
         )
-    frames = [Similarity(1.0, np.eye(4))]
+    return best, best_db
+
+
+def _frames(images: Path) -> list[Similarity]:
+    """From the frames that a splat of these images may be trained in to the world: the scan's, COLMAP's, nerfstudio's scaled one, the world itself."""
     facts: dict[str, Any] = {}
     if (report := (images if images.is_dir() else images.parent) / REPORT_FILE).is_file():
         facts = read_json(report)
@@ -157,23 +161,34 @@ def _placed_by_images(
         raise ImportRecordingError(
             f"expected a data set in metres at {images}, got {got}; make it with advnerf scene from-scan and --length, --positions or --marker"
         )
-    if "T_world_from_scan" in facts:
-        frames.insert(
-            0, Similarity(float(facts["metres_per_unit"]), np.array(facts["T_world_from_scan"], np.float64))
+    world = Similarity(1.0, np.eye(4))
+    if "T_world_from_scan" not in facts:
+        return [world]
+    world_from_scan = _similarity(facts["metres_per_unit"], facts["T_world_from_scan"])
+    scan = facts.get("scan", {})
+    trained = [
+        world_from_scan.after(_similarity(scan[unit], scan[pose]))
+        for unit, pose in (
+            ("scan_units_per_dataparser_unit", "T_scan_from_dataparser"),
+            ("scan_units_per_colmap_unit", "T_scan_from_colmap"),
         )
-    flips: list[Array] = [np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])]
-    found = []
-    for frame in frames:
-        for flip in flips:
-            similarity = Similarity(frame.scale, frame.T_target_from_source @ flip)
-            found.append((_agreement_db(SplatRenderer(splats.moved(similarity), behind), views), similarity))
-    best_db, best = max(found, key=lambda pair: pair[0])
-    if best_db < _LEAST_PSNR_DB:
-        raise ImportRecordingError(
-            f"expected a splat that shows the images of {images}, got a PSNR of {best_db:.1f} dB to them at best (at least {_LEAST_PSNR_DB:g}); give the "
-            "images that it was trained on, in the frame it was trained in, or place it with --metres-per-unit, --up and --origin"
-        )
-    return best, best_db
+        if unit in scan
+    ]
+    return [world_from_scan, *trained, world]
+
+
+def _similarity(scale: float, T_target_from_source: list[list[float]]) -> Similarity:
+    return Similarity(float(scale), np.array(T_target_from_source, np.float64))
+
+
+def _views(listed: PosedImages) -> list[ImageSet]:
+    """A few of the images, small, each with its own lens."""
+    chosen = np.unique(np.linspace(0, len(listed.frames) - 1, _COMPARED).astype(int))
+    views = []
+    for frame in (listed.frames[k] for k in chosen):
+        height_px = max(1, round(_COMPARED_PX * frame.pinhole.height / frame.pinhole.width))
+        views.append(listed.with_frames([frame]).load((_COMPARED_PX, height_px)))
+    return views
 
 
 def _agreement_db(renderer: SplatRenderer, views: list[ImageSet]) -> float:

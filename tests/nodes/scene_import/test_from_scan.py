@@ -17,7 +17,7 @@ from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import HELD_OUT_SPLITS
 from advnerf_core.errors import AdvnerfError
 from calibration.scans.reading import READERS
-from calibration.scans.scan import ScanOptions
+from calibration.scans.scan import ScanError, ScanOptions
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.media import MediaConfig, gather
 from nodes.lab.importing.metric_options import MetricOptions
@@ -334,22 +334,35 @@ def test_a_mask_of_another_size_or_without_a_pixel_leaves_its_image_out(tmp_path
     load_transforms(tmp_path / "out").load()
 
 
-def test_the_world_of_a_trained_model_is_found_again(tmp_path):
+@pytest.mark.parametrize("applied_scale", [1.0, 0.4])
+def test_the_world_of_a_trained_model_is_found_again(tmp_path, applied_scale):
     scan = scan_samples.nerfstudio(tmp_path / "scan")
     content = json.loads((scan / "transforms.json").read_text())
-    applied = np.vstack([content["applied_transform"], [0, 0, 0, 1]])
-    transform = np.array([[0.0, 0.0, 1.0, 0.3], [1.0, 0.0, 0.0, -0.2], [0.0, 1.0, 0.0, 0.1]])
+    content["applied_transform"] = applied = [[0.0, 1, 0, 0.5], [1, 0, 0, -0.3], [0, 0, -1, 0.2]]
+    (scan / "transforms.json").write_text(json.dumps(content | {"applied_scale": applied_scale}))
+    # As nerfstudio does it: it turns and scales the poses of the file, then writes what takes COLMAP's world there.
+    oriented = np.array([[0.0, 0, 1, 0.3], [1, 0, 0, -0.2], [0, 1, 0, 0.1], [0, 0, 0, 1]])
+    transform = (oriented @ np.vstack([applied, [0, 0, 0, 1]]))[:3]
     (scan / "dataparser_transforms.json").write_text(
-        json.dumps({"transform": transform.tolist(), "scale": 0.7})
+        json.dumps({"transform": transform.tolist(), "scale": 0.7 * applied_scale})
     )
     _, report = run(tmp_path, scan)
     in_colmap = np.array([0.3, -0.1, 0.5, 1.0])
-    in_model = 0.7 * transform @ in_colmap
+    in_file = applied_scale * np.array(applied) @ in_colmap
+    in_model = 0.7 * (oriented @ [*in_file, 1.0])[:3]
     facts = report["scan"]
-    unscaled = np.append(facts["scan_units_per_dataparser_unit"] * in_model, 1.0)
-    np.testing.assert_allclose(
-        np.array(facts["T_scan_from_dataparser"]) @ unscaled, applied @ in_colmap, atol=1e-12
-    )
+    for name, point in (("dataparser", in_model), ("colmap", in_colmap[:3])):
+        unscaled = np.append(facts[f"scan_units_per_{name}_unit"] * point, 1.0)
+        np.testing.assert_allclose((facts[f"T_scan_from_{name}"] @ unscaled)[:3], in_file, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, "a"])
+def test_an_applied_scale_that_is_none_is_refused(tmp_path, value):
+    scan = scan_samples.nerfstudio(tmp_path / "scan")
+    content = json.loads((scan / "transforms.json").read_text())
+    (scan / "transforms.json").write_text(json.dumps(content | {"applied_scale": value}))
+    with pytest.raises(ScanError, match="applied_scale: expected a (finite )?number"):
+        run(tmp_path, scan)
 
 
 def test_a_known_length_gives_metres(tmp_path):

@@ -76,13 +76,29 @@ def data_set(folder, truth, **report):
     return folder
 
 
+# From the frame that a splat is trained in to that of the scan: itself, COLMAP's, and nerfstudio's, which its export keeps.
+TRAINED_IN = {
+    "scan": Similarity(1.0, np.eye(4)),
+    "colmap": Similarity(
+        3.0, make_transform(np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]), [0.3, 0.0, 0.6])
+    ),
+    "dataparser": Similarity(
+        5.0, make_transform(np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0.0]]), [0.5, -0.2, 0.1])
+    ),
+}
+
+
+def inverse(similarity):
+    back, scale = invert_transform(similarity.T_target_from_source), 1.0 / similarity.scale
+    return Similarity(scale, make_transform(back[:3, :3], scale * back[:3, 3]))
+
+
 @pytest.mark.parametrize("flipped", [False, True])
-def test_the_images_it_was_trained_on_place_a_splat(tmp_path, flipped):
+@pytest.mark.parametrize("frame", TRAINED_IN)
+def test_the_images_it_was_trained_on_place_a_splat(tmp_path, frame, flipped):
     truth = room(3000)
-    world_from_colmap = Similarity(0.5, make_transform(TURN, [1.0, 2.0, 3.0]))
-    inverse = invert_transform(world_from_colmap.T_target_from_source)
-    colmap_from_world = Similarity(2.0, make_transform(inverse[:3, :3], 2.0 * inverse[:3, 3]))
-    trained = truth.moved(colmap_from_world)
+    trained = truth.moved(inverse(Similarity(0.5, make_transform(TURN, [1.0, 2.0, 3.0]))))
+    trained = trained.moved(inverse(TRAINED_IN[frame]))
     if flipped:
         trained = trained.moved(Similarity(1.0, np.diag([1.0, -1.0, -1.0, 1.0])))
     images = data_set(
@@ -91,10 +107,15 @@ def test_the_images_it_was_trained_on_place_a_splat(tmp_path, flipped):
         scale_from="length",
         metres_per_unit=0.5,
         T_world_from_scan=make_transform(TURN, [1.0, 2.0, 3.0]).tolist(),
+        scan={f"scan_units_per_{name}_unit": TRAINED_IN[name].scale for name in ("colmap", "dataparser")}
+        | {
+            f"T_scan_from_{name}": TRAINED_IN[name].T_target_from_source.tolist()
+            for name in ("colmap", "dataparser")
+        },
     )
     found = from_splat(write_ply(tmp_path / "a.ply", trained), tmp_path / "s", SplatOptions(images=images))
     assert found.psnr_db > 30.0
-    assert found.metres_per_unit == 0.5
+    assert found.metres_per_unit == pytest.approx(0.5 * TRAINED_IN[frame].scale)
     placed = load_splat_scene(tmp_path / "s")[0].splats
     np.testing.assert_allclose(np.sort(placed.means_m, axis=0), np.sort(truth.means_m, axis=0), atol=1e-4)
 
