@@ -71,6 +71,21 @@ def flipped(content, at, bit=0):
     return bytes(damaged)
 
 
+@pytest.mark.parametrize("first", KINDS)
+def test_a_second_recording_behind_the_first_is_told_and_not_dropped(first, bags, write):
+    other = bags["ours"]
+    path = write(bags[first] + other)
+    for tried in (lambda: read_info(path), lambda: repair(path)):
+        with pytest.raises(BagError, match="damaged|another recording at byte"):
+            tried()
+    assert path.read_bytes() == bags[first] + other
+    done = repair(path, force=True)
+    assert done.messages == 60
+    assert done.cut_bytes >= len(other)
+    assert f"another recording at byte {len(bags[first])}" in " ".join(done.losses)
+    assert messages_of(path) == reachable(bags[first])
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_file_is_read_as_an_independent_reader_reads_it(kind, bags, write):
     path = write(bags[kind])
