@@ -361,7 +361,7 @@ def test_an_applied_scale_that_is_none_is_refused(tmp_path, value):
     scan = scan_samples.nerfstudio(tmp_path / "scan")
     content = json.loads((scan / "transforms.json").read_text())
     (scan / "transforms.json").write_text(json.dumps(content | {"applied_scale": value}))
-    with pytest.raises(ScanError, match="applied_scale: expected a (finite )?number"):
+    with pytest.raises(ScanError, match=r"applied_scale: expected a (finite )?number"):
         run(tmp_path, scan)
 
 
