@@ -45,6 +45,7 @@ class _Record(NamedTuple):
     values: dict[str, Any]
     folder: Path
     time_ms: float
+    number: int | None
 
 
 def read_tub(path: Path, choice: LogChoice) -> DriveLog:
@@ -83,13 +84,16 @@ def read_tub(path: Path, choice: LogChoice) -> DriveLog:
     times_s = [1e-3 * each.time_ms for each in driven]
 
     def frames() -> Iterator[LogFrame]:
+        last: int | None = None
         for number, (each, value) in enumerate(zip(driven, values, strict=True)):
             stamp_ns = number if math.isnan(each.time_ms) else round(each.time_ms * _NS_PER_MS)
             try:
                 rgb, _ = read_stored(each.folder / each.values[images])
             except DatasetError as error:
                 raise LogError(f"{each.place}: {error}, or delete the record") from error
-            yield LogFrame(rgb, stamp_ns, float(value), each.place)
+            skipped = last is not None and each.number is not None and each.number != last + 1
+            last = each.number
+            yield LogFrame(rgb, stamp_ns, float(value), each.place, after_gap=skipped)
 
     return DriveLog(
         path,
@@ -142,7 +146,9 @@ def _version_2(path: Path) -> tuple[tuple[list[_Record], tuple[Path, ...]], dict
                 f"{place}: _index: expected one that no record has, got {index}, which {earlier} has; images are named after it, so that this one's "
                 "was written over that one's: delete the earlier record"
             )
-        records.append(_Record(place, values, path / "images", _time_ms(values.get("_timestamp_ms"))))
+        number = index if type(index) is int else None
+        time_ms = _time_ms(values.get("_timestamp_ms"))
+        records.append(_Record(place, values, path / "images", time_ms, number))
     return (records, (manifest, *catalogs)), dict(counts)
 
 
@@ -152,10 +158,10 @@ def _version_1(path: Path) -> tuple[tuple[list[_Record], tuple[Path, ...]], dict
     )
     exclude = path / "exclude.json"
     excluded = _deleted(str(exclude), read_json(exclude)) if exclude.is_file() else set()
-    kept = [file for number, file in numbered if number not in excluded]
+    kept = [(number, file) for number, file in numbered if number not in excluded]
     records = [
-        _Record(str(file), values, path, _time_ms(values.get("milliseconds")))
-        for file in kept
+        _Record(str(file), values, path, _time_ms(values.get("milliseconds")), number)
+        for number, file in kept
         for values in [_object(str(file), read_json(file))]
     ]
     files = tuple(file for _, file in numbered)

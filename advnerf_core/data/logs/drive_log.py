@@ -97,6 +97,7 @@ class LogFrame:
         state: x [m], y [m], yaw [rad] of the rear axle; NaN if not measured.
         unusable: Why the frame must not be learned from, such as ``not armed``; empty if it may.
         disturbed: Whether the recorded steering is not what the driver wanted.
+        after_gap: Whether frames before it are left out, such as records that were deleted.
     """
 
     image: Rgb
@@ -107,6 +108,7 @@ class LogFrame:
     state: tuple[float, float, float] = NOWHERE
     unusable: str = ""
     disturbed: bool = False
+    after_gap: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -166,7 +166,7 @@ def _usable(log: DriveLog, rate_hz: int, left_out: Counter[str]) -> Iterator[tup
             skipped = True
             continue
         paused = timed and abs(frame.stamp_ns - last_ns) > _GAP_FRAMES * 1e9 / rate_hz
-        if skipped or paused:
+        if skipped or paused or frame.after_gap:
             episode, number, skipped = episode + 1, -1, False
         number, last_ns = number + 1, frame.stamp_ns
         action = (log.unit.wheel_rad(frame.steering, frame.place), frame.speed_mps)

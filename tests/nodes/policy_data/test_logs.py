@@ -317,6 +317,23 @@ def test_times_that_go_back_start_another_drive_and_rows_without_times_do_not(tm
 
 
 @pytest.mark.parametrize(
+    ("write", "episodes"),
+    [
+        (lambda folder: write_tub_2(folder, step_ms=None), 1),
+        (lambda folder: write_tub_2(folder, step_ms=None, deleted=[0, 5, 11]), 2),
+        (lambda folder: write_tub_2(folder, step_ms=None, piloted=[3, 4, 9]), 3),
+        (lambda folder: write_tub_2(folder, deleted=[5]), 2),
+        (lambda folder: write_tub_1(folder, removed=[4]), 2),
+        (lambda folder: write_tub_1(folder, excluded=[4, 9]), 3),
+    ],
+)
+def test_records_that_were_deleted_end_an_episode(tmp_path, write, episodes):
+    pytest.importorskip("pyarrow")
+    log = open_log(write(tmp_path / "tub"), LogChoice(steering_full_rad=0.4))
+    assert write_lerobot(log, tmp_path / "out", 10).episodes == episodes
+
+
+@pytest.mark.parametrize(
     ("step_ms", "rate_hz", "said"),
     [
         (100, 30, "--rate: expected about 10, the images per second of .*tub, got 30; leave it out"),
