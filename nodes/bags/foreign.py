@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,19 @@ def stored_messages(
                 topic = names[connection.id]
                 yield connection.id, BagMessage(topic, bytes(data), log_ns, log_ns, counts[topic])
                 counts[topic] += 1
+
+
+def stored_times(path: Path) -> Iterator[tuple[str, int]]:
+    """Yield topic and log time [ns since 1970] of the messages of an SQLite file, in the order in which they were written.
+
+    Source: ``rosbag2_storage_sqlite3``, ``sqlite_storage.cpp``: ``messages.id`` is the primary key, so it counts up.
+    """
+    query = "SELECT name, timestamp FROM messages JOIN topics ON topic_id = topics.id ORDER BY messages.id"
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as stored:
+            yield from stored.execute(query)
+    except sqlite3.Error as error:
+        raise BagError(f"{path} is {BagFormat.SQLITE.value}, and cannot be read: {error}") from error
 
 
 def _recorded(connection: Any, form: BagFormat) -> RecordedTopic:

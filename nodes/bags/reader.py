@@ -22,7 +22,7 @@ from nodes.bags.chunks import (
     times_as_written,
 )
 from nodes.bags.file import open_bag
-from nodes.bags.foreign import read_stored, stored_messages
+from nodes.bags.foreign import read_stored, stored_messages, stored_times
 from nodes.bags.formats import BagFormat, recognise
 from nodes.bags.info import BagInfo, BagMessage, FileInfo, TopicInfo
 from nodes.bags.message_definitions import full_type_name
@@ -75,11 +75,13 @@ def message_spans(bag: Path) -> list[tuple[int, int]]:
 
 
 def read_times_as_written(bag: Path) -> Iterator[tuple[str, int]]:
-    """Yield topic and log time [ns since 1970] of all messages as written. Other formats than MCAP do not say that order: theirs are left out."""
+    """Yield topic and log time [ns since 1970] of all messages as written. ROS 1 bags do not say that order: theirs are left out."""
     for part in _parts(bag):
         if part.format is BagFormat.MCAP:
             with open_bag(part.path) as file:
                 yield from times_as_written(file, _whole_file(part.path))
+        elif part.format is BagFormat.SQLITE:
+            yield from stored_times(part.path)
 
 
 def read_attachment(bag: Path, name: str) -> bytes:

@@ -3,6 +3,7 @@
 import bz2
 import contextlib
 import gzip
+import re
 import sqlite3
 import struct
 import zipfile
@@ -22,6 +23,7 @@ from nodes.bags.message_definitions import as_our_message, parse_definition
 from nodes.bags.reader import read_attachments, read_info, read_messages
 from nodes.bags.repair_parts import repair_bag
 from nodes.bags.stamps import read_delays
+from nodes.bags.time_gaps import read_steps_back
 from nodes.lab.trials.evaluation import trajectory
 from nodes.runtime.errors import BagError, MessageError
 from nodes.runtime.messages import (
@@ -35,6 +37,7 @@ from nodes.runtime.messages import (
     types,
 )
 from nodes.runtime.pictures import rgb_image
+from tests.support.commands import advnerf
 from tests.support.foreign_samples import (
     COMPRESSED,
     COUNT,
@@ -395,6 +398,17 @@ def test_messages_that_rosbag2_compressed_are_unpacked(tmp_path):
             database.execute("UPDATE messages SET data = ? WHERE id = ?", (packed, key))
     got = [pose_matrix(decode(POSES[0], m.cdr))[0, 3] for m in read_messages(bag, ["/vicon/car"])]
     np.testing.assert_allclose(got, 0.2 * np.arange(COUNT) - 0.5)
+
+
+def test_a_clock_that_was_set_back_is_named_in_sqlite_too(tmp_path, monkeypatch, capsys):
+    bag = write_rosbag2(tmp_path / "drive", StoragePlugin.SQLITE3)
+    assert read_steps_back(bag) == ()
+    with sqlite3.connect(bag / "drive.db3") as database:
+        database.execute("UPDATE messages SET timestamp = timestamp - 10000000000 WHERE id > 9")
+    (step,) = read_steps_back(bag)
+    assert re.fullmatch(r"log time goes back by (10|9) s after message 9 as recorded", step)
+    assert not advnerf(monkeypatch, "bag", "info", str(bag))
+    assert f"{step}: the recorder's clock was set back" in capsys.readouterr().out
 
 
 def split_sqlite(folder):
