@@ -113,21 +113,35 @@ def evaluate(
             if as_json:
                 print(json.dumps(found))
                 continue
-            leaving = found["time_to_leave_s"]
             rows.add_row(
                 str(bag),
                 " ".join(found["attack_ids"]) or "none",
-                f"{found['total_cte_m']:.3f}",
-                f"{found['mean_abs_cte_m']:.3f}",
-                f"{found['max_abs_cte_m']:.3f}",
-                "yes" if found["off_track"] else "no",
-                "" if leaving is None else f"{leaving:.1f} s",
+                *_totals(found),
                 _added(found.get("counterfactual")),
-                found["stopped_early"],
+                _stopped(found),
                 "unchecked" if found["unchecked"] else "agree",
             )
     if not as_json:
         print_table(rows)
+
+
+def _totals(found: dict[str, Any]) -> tuple[str, ...]:
+    """Texts of the totals of a drive; dashes for one that does not count."""
+    if not found["counts"]:
+        return ("-",) * 5
+    leaving = found["time_to_leave_s"]
+    return (
+        *(f"{found[name]:.3f}" for name in ("total_cte_m", "mean_abs_cte_m", "max_abs_cte_m")),
+        "yes" if found["off_track"] else "no",
+        "" if leaving is None else f"{leaving:.1f} s",
+    )
+
+
+def _stopped(found: dict[str, Any]) -> str:
+    """Text with the end of a drive before the horizon's; empty if it was driven to the end."""
+    if not (why := found["stopped_early"]):
+        return ""
+    return f"{'' if found['counts'] else 'no result: '}{why}, after {found['driven_ticks']} ticks"
 
 
 def _added(compared: dict[str, Any] | None) -> str:

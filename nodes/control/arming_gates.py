@@ -12,6 +12,7 @@ from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.wire import MessageInfo
 
 IDLE, HUMAN, AUTONOMY = "idle", "human", "autonomy"
+NOT_HELD = "the button is not held"
 Point = tuple[float, float]
 _MOST_DOUBT_S = 3600.0
 # Error of a driver that converts a device's clock to real time [s].
@@ -75,7 +76,7 @@ class HandGate:
         if (age_s := (mono_ns - self._since_ns) / NS_PER_S) > self.age_limit_s:
             return self._refused or f"no message from the teleop node for {age_s:.2f} s"
         if self.mode == IDLE:
-            return "the button is not held"
+            return NOT_HELD
         return (
             "" if self.mode in (HUMAN, AUTONOMY) else f"the button is held as {self.mode}; release it first"
         )

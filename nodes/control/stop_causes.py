@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 
 from hardware.motor.vesc_replies import FAULT_NAMES, OVER_CURRENT
+from nodes.control.arming_gates import NOT_HELD
 
 # The texts of `arming`, `arming_gates`, `stall_check` and the safety node. A car that does not move, or whose motor draws too much
 # current, has run into something. A command out of range is the policy's answer to an image.
@@ -16,7 +17,7 @@ _RESULT = re.compile(
     r"the car is outside the fence|the car is [\d.]+ m from the fence|stalled for |"
     r"a command of |a command that is not finite|"
     rf"node motor is in state fault: latched: the VESC reports a fault: {FAULT_NAMES[OVER_CURRENT]}|"
-    r"disarmed by |e-stop pressed|the e-stop is pressed|the button is not held"
+    rf"disarmed by |e-stop pressed|the e-stop is pressed|{NOT_HELD}|the trial is over|the trial was ended"
 )
 _STALLED = "stalled for "
 

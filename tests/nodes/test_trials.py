@@ -227,14 +227,15 @@ def test_a_drive_ends_where_the_clock_of_the_recorder_was_set(tmp_path, capsys):
 
 def test_the_numbers_of_a_bag_follow_from_the_bag_alone(tmp_path):
     bag = write_bag(
-        tmp_path, [(1.0, 2.2, "disarmed by trial: trial is over"), (0.5, 1.0, "outside the fence")]
+        tmp_path, [(1.0, 2.2, "disarmed by trial: trial is over"), (0.5, 1.0, "the car is outside the fence")]
     )
     whole, broken = evaluate_bag(bag, None, ticks=20)
     # On the straight the error is the offset at each of the 20 ticks, and the held one after an early stop too.
     assert whole["total_cte_m"] == pytest.approx(20 * 0.1, abs=1e-6)
     assert (whole["stopped_early"], whole["off_track"]) == ("", False)
     assert broken["total_cte_m"] == pytest.approx(20 * 0.1, abs=1e-6)
-    assert broken["stopped_early"] == "outside the fence"
+    assert broken["stopped_early"] == "the car is outside the fence"
+    assert [(each["counts"], each["driven_ticks"]) for each in (whole, broken)] == [(True, 20), (True, 9)]
     first = find_drives(bag)[0]
     # 1 cm at 0.8 m/s is passed with the second pose after the start.
     assert (first.start_real_ns - START_NS) / 1e9 == pytest.approx(1.02, abs=0.011)
@@ -253,6 +254,85 @@ def copied(bag, folder, keep=lambda message: True, more=()):
         for number, (at_ns, topic, cdr) in enumerate(sorted([*old, *new], key=lambda each: each[0])):
             writer.write(topic, cdr, at_ns, at_ns, number)
     return folder
+
+
+def let_go(at_ns, why):
+    act = filled(types.OperatorAct, header=header(at_ns), act="let_go", detail=why, granted=True)
+    return "/operator/act", act, at_ns
+
+
+@pytest.mark.parametrize(
+    ("reason", "page", "said"),
+    [
+        ("no command from the policy for 0.22 s", "", "no result: no command from the policy for 0.22 s"),
+        ("the button is not held", "", "the button is not held"),
+        (
+            "the button is not held",
+            "the page has not answered for 0.26 s",
+            "no result: the page has not answered for 0.26 s",
+        ),
+        ("the button is not held", "the trial was ended", "the trial was ended"),
+        ("the car is outside the fence", "the trial was ended", "the car is outside the fence"),
+    ],
+)
+def test_a_drive_that_a_fault_of_the_stack_ended_is_no_result_of_a_bag_either(tmp_path, reason, page, said):
+    """As on the page and in ``car trial``, by one rule; the page knows better why a button was not held."""
+    bag = write_bag(tmp_path, [(1.0, 0.99, reason), (0.5, 2.2, "disarmed by trial: trial is over")])
+    if page:
+        at_ns = find_drives(bag)[0].end_real_ns - NS_PER_S // 50
+        earlier = let_go(at_ns - 3 * NS_PER_S, "the picture on the page is 1.2 s old")
+        bag = copied(bag, tmp_path / "told", more=[earlier, let_go(at_ns, page)])
+    ended, whole = evaluate_bag(bag, None, ticks=20)
+    counts = not said.startswith("no result: ")
+    assert ended["stopped_early"] == said.removeprefix("no result: ")
+    assert (ended["counts"], ended["driven_ticks"], len(ended["states"])) == (counts, 9, 21)
+    assert (ended["total_cte_m"] is None) == (ended["off_track"] is None) == (not counts)
+    assert whole["counts"]
+    shown = CliRunner().invoke(app, ["bag", "evaluate", str(bag), "--ticks", "20"], env={"COLUMNS": "240"})
+    assert f"{said}, after 9 ticks" in shown.stdout
+
+
+def test_a_drive_whose_end_is_not_in_the_bag_is_no_result(tmp_path):
+    bag = write_bag(tmp_path, [(1.0, 2.2, "disarmed by trial: trial is over")])
+    end_ns = find_drives(bag)[0].start_real_ns + NS_PER_S
+    (cut,) = evaluate_bag(copied(bag, tmp_path / "cut", lambda each: each.log_ns < end_ns), None, ticks=20)
+    assert (cut["counts"], cut["total_cte_m"]) == (False, None)
+    assert cut["stopped_early"] == "the bag ends while the car drives"
+
+
+def test_a_drive_whose_beginning_is_not_in_the_bag_is_left_out(tmp_path, capsys):
+    """Its start would be wherever the recording began."""
+    drives = [(2.0, 2.2, "disarmed by trial: trial is over"), (0.5, 2.2, "disarmed by trial: trial is over")]
+    bag = write_bag(tmp_path, drives)
+    expected = evaluate_bag(bag, None, ticks=20)
+    first, second = find_drives(bag)
+
+    def later(begin_ns, name):
+        state = filled(types.SafetyState, header=header(begin_ns), armed=True)
+        kept = copied(
+            bag, tmp_path / name, lambda each: each.log_ns >= begin_ns, [("/safety/state", state, begin_ns)]
+        )
+        return evaluate_bag(kept, None, ticks=20)
+
+    (found,) = later(first.start_real_ns + NS_PER_S, "middle")
+    assert found["states"] == expected[1]["states"]
+    assert "the recording began while the car was driving" in capsys.readouterr().err
+    # A car that was armed before, and stood, has its beginning in the bag.
+    assert len(later(first.start_real_ns - 3 * NS_PER_S // 2, "armed")) == 2
+    only = copied(
+        bag,
+        tmp_path / "only",
+        lambda each: first.start_real_ns + NS_PER_S <= each.log_ns < second.start_real_ns - NS_PER_S // 4,
+        [
+            (
+                "/safety/state",
+                filled(types.SafetyState, armed=True, header=header(first.start_real_ns + NS_PER_S)),
+                first.start_real_ns + NS_PER_S,
+            )
+        ],
+    )
+    with pytest.raises(BagError, match="expected a drive from its beginning"):
+        evaluate_bag(only, None, ticks=20)
 
 
 @pytest.mark.parametrize("topic", ["/compositor/attack", "/monitor/attack"])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,12 +16,22 @@ from calibration.schema import RoomCalibration, load_calibration, parse_calibrat
 from nodes.bags.decoded import read_decoded
 from nodes.bags.reader import read_attachments, read_info
 from nodes.bags.time_gaps import skipped_gaps
+from nodes.control.arming_gates import NOT_HELD
+from nodes.control.stop_causes import is_result
 from nodes.lab.trials.evaluation import SHOWN_BY, attack_ids, counterfactual, score, timing, trajectory
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import pose_matrix, stamp_ns
 
 _ROOM = "room.yaml"
+_ACTS, _LET_GO = "/operator/act", "let_go"
+# A drive begins with a car that stands: without an arming before it, this long [s].
+_STOOD_S = 1.0
+# Between the page's word about a button and the disarming that follows; the two may be on two hosts [s].
+_TOGETHER_S = 1.0
+_BAG_ENDS = "the bag ends while the car drives"
+_BEGUN_LATE = "the recording began while the car was driving, so that the drive has no beginning"
+_TOTALS = ("total_cte_m", "mean_abs_cte_m", "max_abs_cte_m", "off_track", "time_to_leave_s")
 
 
 @dataclass(frozen=True)
@@ -29,7 +41,7 @@ class DriveSpan:
     Attributes:
         start_real_ns: Stamp of the first pose that differs from the pose at arming [ns].
         end_real_ns: Time of the disarming, or end of the bag [ns].
-        reason: Reason of the disarming; empty if the bag ends first.
+        reason: Reason of the disarming, or that the bag ends first.
     """
 
     start_real_ns: int
@@ -38,10 +50,10 @@ class DriveSpan:
 
 
 def find_drives(bag: Path) -> list[DriveSpan]:
-    """Find all drives of a bag, each from the first motion after an arming to the disarming.
+    """Find all drives of a bag, each from the first motion after an arming to the disarming. One whose beginning is not in the bag is left out, and told.
 
     Raises:
-        BagError: The car was never armed, or never moved while armed.
+        BagError: The car was never armed, never moved while armed, or was driving when the recording began.
     """
     _require(bag, ("/safety/state", "/vicon/car"))
     armings = _armings(bag)
@@ -50,22 +62,30 @@ def find_drives(bag: Path) -> list[DriveSpan]:
             f"expected a bag in which the car is armed, got no armed state on /safety/state in {bag}; give the bag of a drive"
         )
     stamps, xy = _positions(bag)
-    spans = []
-    gaps = skipped_gaps(bag)
-    for armed_ns, disarmed_ns, reason in armings:
-        first = int(np.searchsorted(stamps, armed_ns))
+    spans, begun_late = list[DriveSpan](), False
+    gaps, let_go = skipped_gaps(bag), _made_to_let_go(bag)
+    for arming in armings:
+        first = int(np.searchsorted(stamps, arming.since_ns))
         origin = xy[max(first - 1, 0)]
         moved = np.flatnonzero(np.linalg.norm(xy[first:] - origin, axis=1) > MOVED_M)
         start_ns = int(stamps[first + moved[0]]) if moved.size else None
-        end_ns = int(stamps[-1]) if disarmed_ns is None else disarmed_ns
+        end_ns = int(stamps[-1]) if arming.until_ns is None else arming.until_ns
+        reason = _BAG_ENDS if arming.until_ns is None else _why_disarmed(arming.reason, end_ns, let_go)
         for gap in gaps:  # a drive ends where the clock was set, as later times are not comparable
-            if armed_ns <= gap.before_ns < end_ns:
+            if arming.since_ns <= gap.before_ns < end_ns:
                 end_ns, reason = gap.before_ns, str(gap)
-        if start_ns is not None and start_ns < end_ns:
-            spans.append(DriveSpan(start_ns, end_ns, reason))
+        if start_ns is None or start_ns >= end_ns:
+            continue
+        if not arming.is_seen and start_ns - max(arming.since_ns, int(stamps[0])) < _STOOD_S * NS_PER_S:
+            begun_late = True
+            print(f"{bag}: {_BEGUN_LATE}; it is left out", file=sys.stderr, flush=True)
+            continue
+        spans.append(DriveSpan(start_ns, end_ns, reason))
     if not spans:
         raise BagError(
-            f"expected the car to move while it is armed, got no motion in {bag}; give the bag of a drive"
+            f"expected a drive from its beginning in {bag}, but {_BEGUN_LATE}; record from before the car is armed"
+            if begun_late
+            else f"expected the car to move while it is armed, got no motion in {bag}; give the bag of a drive"
         )
     return spans
 
@@ -81,7 +101,8 @@ def measure_drive(
     """Evaluate one drive as plain data: trajectory, cross-track errors, latency, shown attacks.
 
     Args:
-        stopped: Why the car was stopped before the horizon's end; empty if it was not. Its last error is then held.
+        stopped: Why the car was stopped before the horizon's end; empty if it was not. Its last error is then held. If a fault of the stack
+            stopped it, or the bag ends, the drive does not count and has no totals.
     """
     stopped_s = (span.end_real_ns - span.start_real_ns) / NS_PER_S if stopped else None
     driven = horizon if stopped_s is None else replace(horizon, ticks=_ticks_until(stopped_s, horizon))
@@ -98,13 +119,14 @@ def measure_drive(
         "attack_ids": sorted(attack_ids(bag, SHOWN_BY, span.start_real_ns, span.end_real_ns)),
         "states": held.tolist(),
         "stopped_early": stopped,
+        "counts": is_result(stopped),
+        "driven_ticks": horizon.ticks - metrics.held_ticks,
         "cte_m": path.project(held[:, :2]).cte_m.tolist(),
-        "total_cte_m": metrics.total_cte_m,
-        "mean_abs_cte_m": metrics.mean_cte_m,
-        "max_abs_cte_m": metrics.max_cte_m,
-        "off_track": metrics.off_track,
-        "time_to_leave_s": metrics.time_to_leaving_s,
+        **dict.fromkeys(_TOTALS),
     }
+    if found["counts"]:
+        totals = (metrics.total_cte_m, metrics.mean_cte_m, metrics.max_cte_m, metrics.off_track)
+        found |= zip(_TOTALS, (*totals, metrics.time_to_leaving_s), strict=True)
     present = {topic.name for topic in read_info(bag).topics}
     if {"/camera/image_raw", "/compositor/image", "/policy/drive", "/safety/drive", "/motor/sent"} <= present:
         # A frame captured less than a tick before the end may find the car disarmed.
@@ -135,7 +157,7 @@ def measure_drives(bag: Path, room: RoomCalibration, ticks: int) -> list[dict[st
     results = []
     for span in find_drives(bag):
         early = (span.end_real_ns - span.start_real_ns) / NS_PER_S < wanted.ticks * wanted.dt_s
-        stopped = (span.reason or "the bag ends") if early else ""
+        stopped = span.reason if early else ""
         found = measure_drive(bag, span, room.reference_path, wanted, stopped)
         unchecked = {"unchecked": read_info(bag).unchecked}
         results.append({"bag": str(bag), "start_real_ns": span.start_real_ns, **unchecked, **found})
@@ -156,18 +178,42 @@ def _require(bag: Path, topics: tuple[str, ...]) -> None:
         )
 
 
-def _armings(bag: Path) -> list[tuple[int, int | None, str]]:
-    """Times of arming and disarming [ns, CLOCK_REALTIME], and the reason of the disarming."""
-    spans: list[tuple[int, int | None, str]] = []
-    since: int | None = None
+class _Arming(NamedTuple):
+    """From an armed state to the disarming; None if the bag ends first. ``is_seen``: a state before it says that the car was not armed."""
+
+    since_ns: int
+    until_ns: int | None
+    reason: str
+    is_seen: bool
+
+
+def _armings(bag: Path) -> list[_Arming]:
+    """When the car was armed [ns, CLOCK_REALTIME], and why it was disarmed."""
+    found: list[_Arming] = []
+    since_ns: int | None = None
+    disarmed = False
     for state in read_decoded(bag, "/safety/state"):
-        stamp = stamp_ns(state)
-        if state.armed and since is None:
-            since = stamp
-        elif not state.armed and since is not None:
-            spans.append((since, stamp, str(state.reason)))
-            since = None
-    return spans if since is None else [*spans, (since, None, "")]
+        at_ns = stamp_ns(state)
+        if state.armed and since_ns is None:
+            since_ns = at_ns
+        elif not state.armed:
+            if since_ns is not None:
+                found.append(_Arming(since_ns, at_ns, str(state.reason), disarmed))
+            since_ns, disarmed = None, True
+    return found if since_ns is None else [*found, _Arming(since_ns, None, "", disarmed)]
+
+
+def _made_to_let_go(bag: Path) -> list[tuple[int, str]]:
+    """Times [ns, CLOCK_REALTIME] at which the operator page took a held button for released, and why."""
+    if _ACTS not in {topic.name for topic in read_info(bag).topics}:
+        return []
+    return [(stamp_ns(each), str(each.detail)) for each in read_decoded(bag, _ACTS) if each.act == _LET_GO]
+
+
+def _why_disarmed(reason: str, disarmed_ns: int, let_go: Sequence[tuple[int, str]]) -> str:
+    """The page's reason for a button that is not held: a person who lets go is a result, a page that does not answer is none."""
+    near = [why for at_ns, why in let_go if abs(at_ns - disarmed_ns) <= _TOGETHER_S * NS_PER_S]
+    return near[-1] if near and reason.startswith(NOT_HELD) else reason
 
 
 def _positions(bag: Path) -> tuple[Any, Any]:
