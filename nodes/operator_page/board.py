@@ -13,6 +13,7 @@ import numpy as np
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import yaw_of
 from calibration.schema import RoomCalibration
+from nodes.operator_page.trial import Seen
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.messages import finite_pose, stamp_ns
 from nodes.runtime.topics import STATUS_PREFIX
@@ -50,6 +51,7 @@ class ViewState:
     nodes: tuple[str, ...] = ()
     _newest: dict[str, tuple[Any, int]] = field(default_factory=dict)
     _position_m: tuple[float, float] | None = None
+    _pose_ns: int = 0
     _yaw_rad: float = 0.0
     _trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_TRAIL_POINTS))
     _latency_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_LATENCIES))
@@ -76,10 +78,16 @@ class ViewState:
         """Whether the safety node says that the car is armed."""
         return bool(getattr(self._message(SAFETY), "armed", False))
 
-    @property
-    def stop_reason(self) -> str:
-        """Why the car is not armed, as the safety node said last; empty if it is armed."""
-        return "" if self.armed else str(getattr(self._message(SAFETY), "reason", ""))
+    def seen(self) -> Seen:
+        """What a trial is measured by."""
+        safety = self._message(SAFETY)
+        return Seen(
+            self.armed,
+            0 if safety is None else stamp_ns(safety),
+            None if self._position_m is None else (self._pose_ns, *self._position_m),
+            self._drawn_attack(),
+            "" if self.armed else str(getattr(safety, "reason", "")),
+        )
 
     def hears(self, node: str, now: Now) -> bool:
         """Whether a node has reported a moment ago that it is active."""
@@ -88,19 +96,12 @@ class ViewState:
         return age_s is not None and age_s < _SILENT_S and str(self._message(topic).state) == "active"
 
     @property
-    def position_m(self) -> tuple[float, float] | None:
-        """Newest position of the car [m]."""
-        return self._position_m
-
-    @property
     def label(self) -> Any:
         """Newest message about the attack in an image, of whichever node draws one; None before the first."""
         found = [message for topic in LABELS if (message := self._message(topic)) is not None]
         return next((message for message in found if message.attack_id), found[0] if found else None)
 
-    @property
-    def drawn_attack(self) -> str:
-        """Id of the attack that is shown now; empty for none."""
+    def _drawn_attack(self) -> str:
         return str(self.label.attack_id) if self.label is not None and self.label.drawn else ""
 
     def status_text(self, node: str) -> str:
@@ -156,7 +157,7 @@ class ViewState:
         if (T := finite_pose(message)) is None:
             return  # an occluded subject; the age of the pose on the page grows
         x_m, y_m = float(T[0, 3]), float(T[1, 3])
-        self._position_m, self._yaw_rad = (x_m, y_m), yaw_of(T)
+        self._pose_ns, self._position_m, self._yaw_rad = stamp_ns(message), (x_m, y_m), yaw_of(T)
         if not self._trail or math.dist(self._trail[-1], (x_m, y_m)) >= _TRAIL_STEP_M:
             self._trail.append((x_m, y_m))
 

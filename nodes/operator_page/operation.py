@@ -6,7 +6,7 @@ The desk decides who operates and whether the button counts as held. The safety 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from advnerf_core.geometry import planar_pose
@@ -18,7 +18,7 @@ from nodes.operator_page.desk import Desk
 from nodes.operator_page.diary import Diary
 from nodes.operator_page.recording import LAUNCH_RECORDER, TELEOP, RecorderControl
 from nodes.operator_page.said import ChooseAttack, Hold, Label, Release, Stop, Take
-from nodes.operator_page.trial import Trial
+from nodes.operator_page.trial import RUNNING, Trial
 from nodes.runtime.arm_asker import ArmAsker
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.messages import header, pose_message, stamp_from_ns, types
@@ -129,9 +129,8 @@ class Operation:
         lease = self.desk.lease
         if ended := self.desk.check(now.mono_ns):
             outs += self._ended(ended, lease.name if lease else "", now)
-        board = self.board
-        reason = self._why_ended or board.stop_reason
-        if self.trial.step(board.armed, board.position_m, board.drawn_attack, now.mono_ns, reason):
+        seen = self.board.seen()
+        if self.trial.step(replace(seen, reason=self._why_ended or seen.reason), now.mono_ns):
             outs += self._end_trial("the trial is over", now)
         if self._rearm_ns is not None and now.mono_ns >= self._rearm_ns:
             self._rearm_ns = None
@@ -245,6 +244,8 @@ class Operation:
         """Begin a trial. The simulated car is put to the start; a real one must be carried there."""
         if self.board.armed or self.desk.held:
             return "the car is armed; release the button first", []
+        if self.desk.estop:
+            return "the emergency stop is latched; release it first", []
         self.trial.start()
         if not (self.launched.twin and self.start_pose):
             return "", []
@@ -263,6 +264,8 @@ class Operation:
 
     def _choose(self, attack_id: str, asked: ClientAct, now: Now) -> str:
         entry = self.catalogue.get(attack_id)
+        if refusal := self._switch_refusal():
+            return refusal
         if entry is None:
             return f"no attack {attack_id} among the {len(self.catalogue)} of this page"
         try:
@@ -275,8 +278,14 @@ class Operation:
         return ""
 
     def _attack_off(self, asked: ClientAct, now: Now) -> tuple[str, list[Out]]:
+        if refusal := self._switch_refusal():
+            return refusal, []
         self._switch(False, asked)
         return "", self._attack(now)
+
+    def _switch_refusal(self) -> str:
+        """Return why another attack would spoil what is measured; empty if it would not."""
+        return "a trial is running, of one attack; end it first" if self.trial.phase == RUNNING else ""
 
     def _switch(self, show: bool, asked: ClientAct) -> None:
         self._show, self._switched_by, self._switched_ns = show, self._name(asked), 0

@@ -123,7 +123,7 @@ function showTrial(trial) {
   if (trial.phase === "idle") text("trial-text", "");
   else if (trial.phase === "waiting") text("trial-text", `${begin}: hold the button to begin.`);
   else if (trial.phase === "running") text("trial-text", `${begin}: ${trial.ticks} of ${trial.of_ticks} ticks.`);
-  else if (!trial.counts) text("trial-text", `${begin} is no result: the stack stopped the car after ${trial.ticks} of ${trial.of_ticks} ticks (${trial.stopped}).`);
+  else if (!trial.counts) text("trial-text", `${begin} is no result, after ${trial.ticks} of ${trial.of_ticks} ticks: ${trial.stopped}.`);
   else if (trial.total_cte_m === undefined) text("trial-text", `${begin} has ended.`);
   else {
     const off = trial.off_track ? ", off the track" : "";

@@ -233,6 +233,9 @@ def test_a_trial_runs_from_the_first_motion_and_is_measured(tmp_path):
         run.start()
         ann = Browser(run.port)
         ann.take()
+        assert ann.do("estop") == ""
+        assert ann.do("trial") == "the emergency stop is latched; release it first"
+        assert ann.do("reset_estop") == ""
         assert ann.do("trial") == ""
         ann.wait(lambda: ann.state["trial"]["phase"] == "waiting", "the trial to wait for the car")
         run.car.goes_to_m = 0.012
@@ -244,6 +247,26 @@ def test_a_trial_runs_from_the_first_motion_and_is_measured(tmp_path):
         assert (trial["ticks"], trial["number"]) == (5, 1)
         # The car stands again after this centimetre, so its error is the same at all five ticks.
         assert trial["total_cte_m"] == pytest.approx(5 * abs(ann.state["car"]["cte_m"]), abs=0.01)
+        ann.close()
+    finally:
+        run.close()
+
+
+def test_another_attack_waits_for_the_end_of_a_trial(tmp_path):
+    run = Run(tmp_path, trial_ticks=3000)
+    try:
+        run.start()
+        ann = Browser(run.port)
+        ann.take()
+        assert ann.do("trial") == ""
+        assert ann.do("attack_off") == ""
+        run.car.goes_to_m = 0.012
+        drive(run, ann)
+        ann.wait(lambda: ann.state["trial"]["phase"] == "running", "the trial to run")
+        refusal = "a trial is running, of one attack; end it first"
+        assert [ann.do("attack_off"), ann.do("attack", id="0" * 12)] == [refusal, refusal]
+        assert ann.do("trial_end") == ""
+        assert ann.do("attack_off") == ""
         ann.close()
     finally:
         run.close()
