@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize_scalar
 
 from advnerf_core.attack.printing.frame import CELLS, marker_cells
 from advnerf_core.attack.printing.poster import MM_PER_M, Printable
@@ -26,9 +27,8 @@ _CLIPPED, _MOST_CLIPPED = 252, 0.2
 _LEAST_WHITE, _LEAST_RATIO = 0.02, 2.0  # of linear light; of white to black
 _MOST_UNEVEN = 0.5
 _MOST_HIDDEN, _FAR = 0.5, 64.0
-# Of a photograph: its own blur, of pixels and the interpolation between them, and a larger one that makes it the same for all.
-_OWN_BLUR_PX, _BLUR_PX = 0.6, 1.5
-_BOTH_BLURS_PX = float(np.hypot(_OWN_BLUR_PX, _BLUR_PX))
+# Of a photograph: its own blur, from that of pixels and the interpolation between them to one that is out of focus, and one that is added.
+_OWN_BLURS_PX, _BLUR_PX = (0.3, 4.5), 1.5
 _CELLS, _FINER = 96, 4  # of the found print along a side, and samples along a side of a cell
 _LONGEST_ROW = 2**14  # of OpenCV's remap
 
@@ -41,11 +41,18 @@ class Light:
         white: Coefficients ``[k, 3]`` of white paper's linear light over 1, y, z and, with ``k`` of 6, y^2, y z, z^2 [m].
         black: Linear light ``[3]`` of black ink, as a share of white paper's.
         uneven: Largest change of white over the markers, as a share of its mean.
+        own_blur_px: Standard deviation of the photograph's blur, as the markers' cells show it [px].
     """
 
     white: Array
     black: Array
     uneven: float
+    own_blur_px: float
+
+    @property
+    def blur_px(self) -> float:
+        """Of the photograph's own blur and the added one together [px]."""
+        return float(np.hypot(self.own_blur_px, _BLUR_PX))
 
     def white_at(self, points_m: Array) -> Array:
         """Linear light ``[..., 3]`` of white paper at points ``[..., 3]`` of the print."""
@@ -95,28 +102,26 @@ def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: M
     Raises:
         DegenerateDataError: The paper is overexposed, or too dark.
     """
-    places, shares, seen = [], [], []
+    places, drawn, seen = [], [], []
     for number, corners in corners_m.items():
         points = _over_marker(corners)
         pixel = _pixel(lens, T_camera_from_face, points)
         white = np.pad(marker_cells(number) / 255.0, _PAPER_CELLS, constant_values=1.0)
-        drawn = white.repeat(_FINER, 0).repeat(_FINER, 1)
-        shares.append(_blurred(drawn, _BOTH_BLURS_PX * pixel).ravel())
+        drawn.append((white.repeat(_FINER, 0).repeat(_FINER, 1), pixel))
         linear_seen = linear(sampled(rgb, lens, T_camera_from_face, points))
         seen.append(_blurred(linear_seen, _BLUR_PX * pixel).reshape(-1, 3))
         places.append(points.reshape(-1, 3))
-    share, light, points = (np.concatenate(each) for each in (shares, seen, places))
-    kept = np.isfinite(light).all(axis=1)
-    paper = kept & (share > _PAPER)
-    clipped = float((light[paper] >= linear(_CLIPPED)).any(axis=1).mean()) if paper.any() else 0.0
+    light, points = np.concatenate(seen), np.concatenate(places)
+    terms = _terms(points, 6 if len(corners_m) >= _CURVED_FROM else 3)
+    # Cells of a soft photograph are lit by their neighbours: with too small a blur, ink would be too bright in it.
+    mixed = _mixed(drawn, terms, light)
+    clipped = float((light[mixed.paper] >= linear(_CLIPPED)).any(axis=1).mean()) if mixed.paper.any() else 0.0
     if clipped > _MOST_CLIPPED:
         raise DegenerateDataError(
             f"expected white paper below {_CLIPPED} of 255, got more at {100 * clipped:.0f} % of it: shorten the exposure"
         )
-    terms = _terms(points[kept], 6 if len(corners_m) >= _CURVED_FROM else 3)
-    both = np.concatenate([terms * share[kept, None], terms * (1.0 - share[kept, None])], axis=1)
-    coefficients, of_ink = np.split(np.linalg.lstsq(both, light[kept], rcond=None)[0], 2)
-    fitted, dark = terms @ coefficients, (terms @ of_ink).mean(axis=0)
+    kept = np.isfinite(light).all(axis=1)
+    fitted, dark = terms[kept] @ mixed.white, (terms[kept] @ mixed.ink).mean(axis=0)
     mean = fitted.mean(axis=0)
     if mean.min() < _LEAST_WHITE or (mean < _LEAST_RATIO * dark).any():
         raise DegenerateDataError(
@@ -124,7 +129,35 @@ def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: M
             "lengthen the exposure, or avoid reflections"
         )
     uneven = float((np.ptp(fitted, axis=0) / mean).max())
-    return Light(np.asarray(coefficients), np.clip(dark / mean, 0.0, 1.0), uneven)
+    return Light(mixed.white, np.clip(dark / mean, 0.0, 1.0), uneven, mixed.own_blur_px)
+
+
+@dataclass(frozen=True, eq=False)
+class _Mixed:
+    """Paper and ink at the points of the markers ``[n]``, for a blur of the photograph: coefficients ``[k, 3]``, which points are paper, and the error."""
+
+    own_blur_px: float
+    white: Array
+    ink: Array
+    paper: NDArray[np.bool_]
+    residual: float
+
+
+def _mixed(drawn: Sequence[tuple[Array, float]], terms: Array, light: Array) -> _Mixed:
+    """Paper, ink and the photograph's own blur that explain the light best."""
+    kept = np.isfinite(light).all(axis=1)
+
+    def fit(own_blur_px: float) -> _Mixed:
+        blur_px = float(np.hypot(own_blur_px, _BLUR_PX))
+        share = np.concatenate([_blurred(cells, blur_px * pixel).ravel() for cells, pixel in drawn])
+        both = np.concatenate([terms * share[:, None], terms * (1.0 - share[:, None])], axis=1)[kept]
+        coefficients = np.linalg.lstsq(both, light[kept], rcond=None)[0]
+        residual = float(np.mean((both @ coefficients - light[kept]) ** 2))
+        white, ink = np.split(coefficients, 2)
+        return _Mixed(own_blur_px, white, ink, kept & (share > _PAPER), residual)
+
+    found = minimize_scalar(lambda px: fit(px).residual, bounds=_OWN_BLURS_PX, options={"xatol": 0.01})
+    return fit(float(found.x))
 
 
 def _over_marker(corners: Array) -> Array:
@@ -256,7 +289,7 @@ def print_colours(
         )
     pixel = _pixel(lens, T_camera_from_face, points)
     resolved = encoded(_blurred(linear(raw), _BLUR_PX * pixel))
-    expected = encoded(_blurred(linear(printed), _BOTH_BLURS_PX * pixel))
+    expected = encoded(_blurred(linear(printed), light.blur_px * pixel))
     inside = (np.abs(points[..., 1:]) < 0.5 * np.array(sheet.size_m)).all(axis=-1)
     inside &= np.isfinite(resolved).all(axis=-1)
     off = (_in_white(resolved, light, points, light.black) - expected)[inside]

@@ -135,6 +135,19 @@ def test_a_right_print_is_right_from_afar_and_another_one_is_not(camera, away_m,
         assert wrong.far_share > 0.3
 
 
+@pytest.mark.parametrize("blur_px", [0.0, 1.2, 2.5])
+def test_a_soft_photograph_has_the_colours_of_the_print(blur_px):
+    """Black cells are lit by their white neighbours then, which is not the ink's."""
+    theta = np.random.default_rng(0).normal(0.0, 2.0, (8, 8, 3)).astype(np.float32)
+    sheet = poster_of(face_attack(theta=theta, size_m=(0.4, 0.4), **FACE)).with_markers()
+    T, light = before_camera(0.9, 10, 3, 2), (0.9, 0.8, 0.7)
+    picture = photograph([(scaled(sheet, 1.0, 1.0, 75.0), T)], LENS, light=light, blur_px=blur_px)
+    error = print_colours(picture, LENS, T, sheet, sheet.frame.corners_m).error
+    assert error.rms < 8.0
+    assert np.abs(error.mean).max() < 6.0
+    assert error.far_share < 0.01
+
+
 def test_a_chart_beside_it_is_a_card(call, folder):
     call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 50)
     assert call("car", "calibrate", "printer-chart", "-o", folder / "chart.png", "--dpi", 100)[0] == 0
