@@ -23,7 +23,9 @@ DARKEST = 1e-6
 _LEAST_DETERMINANT = 1e-3
 # Red with green, green with blue, red with blue, all three.
 PAIRS = ((0, 1), (1, 2), (0, 2))
-_NEWTON_STEPS, _SOLVED = 30, 1e-4
+_NEWTON_STEPS = 30
+# A colour counts as shown if it is seen nearer than this to the wanted one: less is within the error of a fit.
+_VISIBLE = 0.01
 
 
 class DisplayModelError(AdvnerfError, ValueError):
@@ -128,18 +130,18 @@ class DisplayModel(PlainData):
             cos_angle: Cosine of the viewing angle ``[...]``, see :meth:`forward`.
 
         Returns:
-            Colours ``[..., 3]`` in 0..1, and the share of them that the monitor cannot show and that were clipped, channel by channel.
+            Colours ``[..., 3]`` in 0..1, and the share of them that the monitor cannot show: they were clipped channel by channel, and are seen
+            more than 0.01 away from the wanted ones.
         """
         target = np.clip(np.asarray(wanted, np.float64), 0.0, 1.0) ** self.response - self.ambient
         gain = np.asarray(cos_angle, np.float64)[..., None] ** self.falloff
         light = (target / gain) @ np.linalg.inv(self.mixing).T
-        outside = ((light < -1e-6) | (light > 1.0 + 1e-6)).any(axis=-1)
         if self.products.any():
             light = self._solved(target / gain, np.clip(light, 0.0, 1.0))
-            outside = np.abs(self._mixed(light) - target / gain).max(axis=-1) > _SOLVED
         levels = np.linspace(0.0, 1.0, self.curves.shape[1])
         shown = np.stack([np.interp(light[..., c], self.curves[c], levels) for c in range(3)], axis=-1)
-        return shown, float(np.mean(outside)) if outside.size else 0.0
+        missed = np.abs(self.forward(shown, cos_angle) - np.clip(wanted, 0.0, 1.0)).max(axis=-1) > _VISIBLE
+        return shown, float(np.mean(missed)) if missed.size else 0.0
 
     def _solved(self, target: Array, light: Array) -> Array:
         """Light ``[..., 3]`` in 0..1 whose mixture is nearly the target, by Newton's method within these bounds."""
