@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,6 +23,8 @@ app = CommandGroup(
 ObjectPath = Annotated[
     Path, typer.Argument(help="An object file (*.object.safetensors).", exists=True, dir_okay=False)
 ]
+_SIZE = "size_m"  # of the mesh, in what an object file says about its source
+_FEW_VOXELS = 4.0
 _TURNTABLE_VIEWS, _TURNTABLE_PIXELS = 8, 240
 _HELD_OUT_EVERY, _FEWEST_TO_SPLIT = 8, 16
 _DEFAULT_STEPS, _NO_STEP_LIMIT = 600, 1_000_000
@@ -140,6 +143,7 @@ def object_build(
             )
         else:
             mesh, source = _mesh(file, generate, up, height_m, unit)
+            source |= {_SIZE: [round(float(side), 6) for side in mesh.size_m]}
             model = build_from_mesh(mesh, name, resolution, 400 if steps is None else steps, source, report)
     save_object(path, model)
     _print_quality(path, model)
@@ -178,7 +182,7 @@ def object_show(
 def _print_facts(model: ObjectModel) -> None:
     rows = table("what", "value")
     rows.add_row("name", model.name)
-    rows.add_row("size", " x ".join(f"{side:.3f}" for side in model.size_m) + " m")
+    rows.add_row("size", _size(model, 3))
     rows.add_row(
         "voxels", " x ".join(map(str, model.grids.density.shape)) + f" of {1e3 * model.grids.voxel:.1f} mm"
     )
@@ -278,8 +282,7 @@ def _spread(listed: PosedImages) -> PosedImages:
 def _print_quality(path: Path, model: ObjectModel) -> None:
     from advnerf_core.objects.voxel.build import advice
 
-    size = " x ".join(f"{side:.2f}" for side in model.size_m)
-    parts = [f"{path}: {size} m"]
+    parts = [f"{path}: {_size(model, 2)}"]
     for key, where in (("train_psnr_db", "training"), ("held_out_psnr_db", "held-out")):
         if key in model.about:
             own = model.about.get(key.replace("psnr", "object_psnr"))
@@ -288,5 +291,20 @@ def _print_quality(path: Path, model: ObjectModel) -> None:
                 + ("" if own is None else f" ({own:.1f} dB on the object)")
             )
     print(", ".join(parts))
-    for text in [*model.about.get("notes", ()), *advice(model.about)]:
+    for text in [*model.about.get("notes", ()), *advice(model.about), *_thin(model)]:
         print(f"warning: {text}")
+
+
+def _size(model: ObjectModel, digits: int) -> str:
+    """Text with the sides of the mesh, or of the box of all voxels, which reaches up to a voxel farther on each side."""
+    sides = model.about.get("source", {}).get(_SIZE)
+    said = " x ".join(f"{side:.{digits}f}" for side in (model.size_m if sides is None else sides))
+    return f"{said} m" + (" with the voxels at its rim" if sides is None else "")
+
+
+def _thin(model: ObjectModel) -> list[str]:
+    """A warning about a mesh whose shortest side has few voxels."""
+    voxels = min(model.about.get("source", {}).get(_SIZE, [math.inf])) / model.grids.voxel
+    if voxels >= _FEW_VOXELS:
+        return []
+    return [f"its shortest side is {voxels:.1f} voxels: it looks wider than it is; raise --resolution"]

@@ -6,6 +6,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from advnerf_core.objects.voxel.build import mesh_views
 from advnerf_core.objects.voxel.generators import hydrant
@@ -32,15 +33,29 @@ def test_build_and_show(command, tmp_path):
     )
     assert code == 0
     assert "on held-out views" in output
-    assert load_object(path).about["source"] == {"generator": "hydrant"}
+    size_m = hydrant().size_m
+    assert load_object(path).about["source"] == {
+        "generator": "hydrant",
+        "size_m": pytest.approx(size_m, abs=1e-6),
+    }
     code, output, _ = command("scene", "object", "show", path, "-o", tmp_path / "h.png")
     assert code == 0
-    assert "0.75" in output
+    assert " x ".join(f"{side:.3f}" for side in size_m) + " m " in output
     assert output.endswith(f"{tmp_path / 'h.png'}\n")
     sheet = cv2.imread(str(tmp_path / "h.png"))
     assert sheet.shape == (480, 960, 3)
     red = (sheet[..., 2] > 120) & (sheet[..., 1] < 80)
     assert 0.02 < red.mean() < 0.3
+
+
+def test_a_mesh_has_its_own_size_and_not_that_of_its_voxels(command, tmp_path):
+    trimesh.creation.box((200, 100, 400)).export(tmp_path / "box.stl")
+    build = ("scene", "object", "build", tmp_path / "box.stl", "--unit", "mm", "--steps", 2)
+    code, output, _ = command(*build, "--resolution", 8, "-o", tmp_path / "a.object.safetensors")
+    assert code == 0
+    assert "0.20 x 0.10 x 0.40 m, " in output
+    assert "warning: its shortest side is 1.0 voxels: it looks wider than it is" in output
+    assert command(*build, "--resolution", 32, "-o", tmp_path / "b.object.safetensors")[1].count("wider") == 0
 
 
 def write_pictures(folder, count, pixels=48, file="transforms.json", phase=0.0, spoilt=False):

@@ -59,11 +59,8 @@ def write_poster(
         raise PrintError(f"expected a .pdf or .png file to write, got {target}; correct --output")
     layout = layout_of(poster.sheet_mm, paper, margin_mm, overlap_mm)
     write_atomically(target, pdf_bytes(poster, layout, paper, dpi))
-    pages = (
-        "1 page of this size"
-        if paper == "none"
-        else f"{layout.rows * layout.columns} pages of {paper.title()}"
-    )
+    count, paper_name = layout.rows * layout.columns, "this size" if paper == "none" else paper.title()
+    pages = f"{count} page{'s' * (count > 1)} of {paper_name}"
     return f"written: {target}, {size}, {pages} and an overview; print at 100 %, no fit to page"
 
 
