@@ -151,7 +151,7 @@ def _transfers(sets: Sequence[Mapping[str, Any]], about: Mapping[str, SetAbout])
     return (
         f"{_counts(sets, about)} In {moved} of {len(pairs)} comparisons the deployed attack moves the car further from its path than controls "
         f"(95 % interval above zero), by {min(each.mean_m for each in smaller):.3f} to {max(each.mean_m for each in smaller):.3f} m per tick over the "
-        f"stronger control; {lacking} have no drives with no object. Of this excess in the learned scene, {100 * min(kept):.0f} to "
+        f"stronger control; {lacking} lack drives with no object. Of this excess in the learned scene, {100 * min(kept):.0f} to "
         f"{100 * max(kept):.0f} % is left.{_claimed(sets)}"
     )
 
@@ -195,7 +195,7 @@ def _better(sets: Sequence[Mapping[str, Any]]) -> str:
     unshown = sum(test.get("p_surrogate") is not None and test["p_surrogate"] >= 0.05 for test in tests)
     return (
         f"Than random textures: deployed, the gradient adds {min(added):.2f} to {max(added):.2f} m per tick, with p < 0.05 in {shown} of {len(tests)} "
-        f"comparisons. {single} of these ran one random family; the others take the one that is strongest in the learned scene."
+        f"comparisons. {single} ran one random family; the others take the strongest in the learned scene."
         + (
             f" In {unshown} the gradient is not shown to be better in the learned scene, where it searches."
             if unshown
@@ -242,7 +242,7 @@ def _worlds(sets: Sequence[Mapping[str, Any]]) -> str:
     names = [str(found["name"]) for found in sets]
     foreign = [each for key, each in _FOREIGN.items() if any(key in name for name in names)]
     elsewhere = f" Also {'; '.join(foreign)}." if foreign else ""
-    return f"In simulated places, driven {driven}.{elsewhere} No real car was driven."
+    return f"In simulated places, driven {driven}.{elsewhere}"
 
 
 def _fast(rows: Sequence[Mapping[str, Any]]) -> str:

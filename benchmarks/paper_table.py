@@ -25,6 +25,7 @@ _CARS = {
     "paper_car_sides": ", one side of the path maximised",
     "paper_car_long": ", one side of the path maximised, searched longer",
     "paper_monitor": ", behind the way of a car that leaves the track",
+    "paper_monitor_wall": ", on the wall",
 }
 _JUNCTIONS = {"paper_junction": "", "paper_junction_sides": ", one side of the path maximised"}
 # The set that attacks something else than colours of voxels, on the straight drive, and what each of its scenarios attacks.

@@ -160,7 +160,7 @@ def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answ
         "# Measured results\n\n"
         + (_PICTURE if sets else "")
         + "Each figure was written by the command beside it. `advnerf verify` computes "
-        "rows of kept drives again; the others were measured once. CHANGELOG.md says how commands changed.\n\n## In short\n\n"
+        "rows of kept drives again; the others were measured once.\n\n## In short\n\n"
         + table(found)
         + (sets and f"\n{sets}")
         + "\n## All rows\n\nA row that misses its target stays, with the reason: [missed targets](results/missed.md).\n\n"

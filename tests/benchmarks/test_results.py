@@ -87,7 +87,7 @@ def test_an_answer_counts_groups_of_searches_and_uses_the_smaller_excess(tmp_pat
     (answer,) = [each.text for each in answers([], tmp_path) if each.question == "Does it transfer?"]
     assert "3 registered sets are 2 groups of searches in 2 worlds: 3 sets explore, 0 confirm." in answer
     # MetaDrive's 0.204 m over the plain panel are 0.067 m over no object.
-    assert "by 0.067 to 0.074 m per tick over the stronger control; 1 have no drives with no object" in answer
+    assert "by 0.067 to 0.074 m per tick over the stronger control; 1 lack drives with no object" in answer
     file = tmp_path / "gap_metadrive" / "set" / "set.json"
     data = json.loads(file.read_text())
     for row in data["rows"]:
