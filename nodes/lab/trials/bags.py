@@ -12,6 +12,7 @@ import numpy as np
 
 from advnerf_core.driving.metrics import MOVED_M, Horizon
 from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.geometry import Array
 from calibration.schema import RoomCalibration, load_calibration, parse_calibration
 from nodes.bags.decoded import read_decoded
 from nodes.bags.reader import read_attachments, read_info
@@ -65,10 +66,7 @@ def find_drives(bag: Path) -> list[DriveSpan]:
     spans, begun_late = list[DriveSpan](), False
     gaps, let_go = skipped_gaps(bag), _made_to_let_go(bag)
     for arming in armings:
-        first = int(np.searchsorted(stamps, arming.since_ns))
-        origin = xy[max(first - 1, 0)]
-        moved = np.flatnonzero(np.linalg.norm(xy[first:] - origin, axis=1) > MOVED_M)
-        start_ns = int(stamps[first + moved[0]]) if moved.size else None
+        start_ns = _first_motion_ns(stamps, xy, arming.since_ns)
         end_ns = int(stamps[-1]) if arming.until_ns is None else arming.until_ns
         reason = _BAG_ENDS if arming.until_ns is None else _why_disarmed(arming.reason, end_ns, let_go)
         for gap in gaps:  # a drive ends where the clock was set, as later times are not comparable
@@ -76,11 +74,11 @@ def find_drives(bag: Path) -> list[DriveSpan]:
                 end_ns, reason = gap.before_ns, str(gap)
         if start_ns is None or start_ns >= end_ns:
             continue
-        if not arming.is_seen and start_ns - max(arming.since_ns, int(stamps[0])) < _STOOD_S * NS_PER_S:
-            begun_late = True
-            print(f"{bag}: {_BEGUN_LATE}; it is left out", file=sys.stderr, flush=True)
+        if arming.is_seen or start_ns - max(arming.since_ns, int(stamps[0])) >= _STOOD_S * NS_PER_S:
+            spans.append(DriveSpan(start_ns, end_ns, reason))
             continue
-        spans.append(DriveSpan(start_ns, end_ns, reason))
+        begun_late = True
+        print(f"{bag}: {_BEGUN_LATE}; it is left out", file=sys.stderr, flush=True)
     if not spans:
         raise BagError(
             f"expected a drive from its beginning in {bag}, but {_BEGUN_LATE}; record from before the car is armed"
@@ -88,6 +86,13 @@ def find_drives(bag: Path) -> list[DriveSpan]:
             else f"expected the car to move while it is armed, got no motion in {bag}; give the bag of a drive"
         )
     return spans
+
+
+def _first_motion_ns(stamps: Array, xy: Array, armed_ns: int) -> int | None:
+    """Stamp of the first pose that differs from the one at arming [ns]; None for a car that stood."""
+    first = int(np.searchsorted(stamps, armed_ns))
+    moved = np.flatnonzero(np.linalg.norm(xy[first:] - xy[max(first - 1, 0)], axis=1) > MOVED_M)
+    return int(stamps[first + moved[0]]) if moved.size else None
 
 
 def _ticks_until(stopped_s: float, horizon: Horizon) -> int:
@@ -216,7 +221,7 @@ def _why_disarmed(reason: str, disarmed_ns: int, let_go: Sequence[tuple[int, str
     return near[-1] if near and reason.startswith(NOT_HELD) else reason
 
 
-def _positions(bag: Path) -> tuple[Any, Any]:
+def _positions(bag: Path) -> tuple[Array, Array]:
     rows = {stamp_ns(pose): pose_matrix(pose)[:2, 3] for pose in read_decoded(bag, "/vicon/car")}
     stamps = sorted(rows)
     return np.array(stamps, np.int64), np.array([rows[stamp] for stamp in stamps])
