@@ -14,12 +14,12 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
-from nodes.linking.keys import KeyFolder, require_address, require_name
+from nodes.linking.keys import DRIVE, WATCH, KeyFolder, require_address, require_name
 from nodes.linking.link import Inbound, Link, LinkConfig, Offset
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import SecurityError
 from nodes.runtime.messages import header, type_hash_prefix, types
-from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.node import ACTIVE, FAULT, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
 from nodes.runtime.topics import topic as topic_row
 from nodes.runtime.wire import Meta
@@ -119,8 +119,7 @@ class GatewayNode(Node):
         meta = Meta(
             info.publish_mono_ns, info.publish_real_ns, info.sequence, self._prefixes[topic], info.instance_id
         )
-        self._link.send(topic, meta, info.raw)
-        self._sent += 1
+        self._sent += self._link.send(topic, meta, info.raw)
         return []
 
     def receive(self, item: Inbound | Offset, now: Now) -> list[Out]:
@@ -144,7 +143,12 @@ class GatewayNode(Node):
         return []
 
     def status(self) -> tuple[str, str]:
-        """Report ready without messages from the other host. The nodes that need them report their own faults."""
+        """Report ready without messages from the other host. The nodes that need them report their own faults.
+
+        A door of the other host that refuses this one is a fault. The right to drive includes watching, so its door is named first.
+        """
+        if refusal := self._link.refusal(DRIVE) or self._link.refusal(WATCH):
+            return FAULT, f"refused {refusal}"
         heard_ns = self._link.heard_mono_ns
         if heard_ns is None and self._watched_only:
             return ACTIVE, f"{self._sent} messages sent; without keys the other host can only watch"

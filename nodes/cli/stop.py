@@ -72,7 +72,7 @@ def _outcome(report: StopReport) -> tuple[str, bool]:
         return f"NOT CONFIRMED: {report.trouble}. The car may be driving. Use the e-stop", False
     if answer is None:
         silence = f"no answer from the safety node for {report.waited_s:.1f} s, and the car may be driving"
-        return f"NOT CONFIRMED: {silence}. {_STILL}", False
+        return ". ".join(filter(None, (f"NOT CONFIRMED: {silence}", _STILL, report.gateway))), False
     if answer.armed:
         return "NOT CONFIRMED: disarmed, but another request has armed the car again since", False
     if answer.braked:

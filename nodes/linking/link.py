@@ -35,6 +35,8 @@ _POLL_MS = 20
 _LOOK_S = 0.5
 _PING_S = 0.2
 _KNOCK_S = 1.0
+# Many attempts: a door that has refused none for so long is gone, and so is its host.
+_REFUSED_S = 15.0
 _LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "advnerf_msgs/msg/FileChunk")
 _SMALL_BYTES = 64 * 2**10
 # TCP detects a lost packet when a later one arrives, and otherwise only after 200 ms or more, which is the lifetime of a command. So
@@ -81,6 +83,7 @@ class Link:
         self._stopping = False
         self._log = RefusalLog()
         self._locked_out: dict[str, float] = {}
+        self._refusals: dict[str, tuple[str, float]] = {}
         self._offsets: dict[str, OffsetFilter] = {}
         self._context: zmq.Context[Any] = zmq.Context()
         self._poller = zmq.Poller()
@@ -100,10 +103,20 @@ class Link:
         """Number of refused handshakes and messages."""
         return self._log.refused
 
-    def send(self, topic: str, meta: Meta, cdr: bytes) -> None:
-        """Send a message to the other end without blocking. If the link is too slow, the oldest message is dropped."""
+    def refusal(self, right: str) -> str:
+        """Where and why the listening end refuses this one's connections to a door at present; empty if it does not."""
+        text, heard_s = self._refusals.get(right, ("", 0.0))
+        return text if time.monotonic() - heard_s < _REFUSED_S else ""
+
+    def send(self, topic: str, meta: Meta, cdr: bytes) -> bool:
+        """Send a message to the other end without blocking. If the link is too slow, the oldest message is dropped.
+
+        Returns:
+            Whether the other end has a chance to get it: not while it refuses the connections of this one.
+        """
         self._outbox.append([topic.encode(), pack_meta(meta), cdr])
         os.eventfd_write(self._wake, 1)
+        return not self.refusal(DRIVE)
 
     def want(self, topics: frozenset[str]) -> None:
         """Receive only these imports from now on, so that topics without readers are not sent."""
@@ -258,8 +271,12 @@ class Link:
 
     def _note(self, event: Handshake) -> None:
         if event.refusal:
-            self._log.refuse(f"handshake at the {event.right} door {event.refusal}")
+            self._log.refuse(event.refusal)
         if not self._config.listens:
+            if event.refusal:
+                self._refusals[event.right] = event.refusal, time.monotonic()
+            elif not event.ended:
+                self._refusals.pop(event.right, None)
             # No reconnection after a successful handshake, because it would end the connection.
             if event.refusal or event.ended:
                 self._locked_out.setdefault(event.right, time.monotonic())

@@ -21,10 +21,11 @@ MOST_BYTES = 16 * 2**20
 # Internal messages of the two ends: the clock question and the heartbeat.
 CLOCK, PULSE = b"_clock", b"_pulse"
 _HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS = 500, 3000
+_UNLISTED = int(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
 _FAILURES = {
-    int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): "refused: its key is not on the list",
-    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "refused: it has no CURVE key, or the wrong key of this host",
-    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): "failed",
+    _UNLISTED: "its key is not on the list",
+    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "it has no CURVE key, or the wrong key of this host",
+    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): "it ended early",
 }
 
 
@@ -71,7 +72,7 @@ class Handshake:
 
     Attributes:
         right: The door.
-        refusal: Why a connection was refused; empty otherwise.
+        refusal: Where and why a connection was refused; empty otherwise.
         ended: Whether a connection ended.
     """
 
@@ -179,7 +180,18 @@ class LinkSockets:
             with contextlib.suppress(zmq.Again):
                 while True:
                     number = int(recv_monitor_message(monitor, zmq.NOBLOCK)["event"])
-                    yield Handshake(right, _FAILURES.get(number, ""), number == zmq.EVENT_DISCONNECTED)
+                    refusal = self._refusal(right, number) if number in _FAILURES else ""
+                    yield Handshake(right, refusal, number == zmq.EVENT_DISCONNECTED)
+
+    def _refusal(self, right: str, number: int) -> str:
+        own, peer = self._config.own, self._config.peer
+        if self._config.listens:
+            return f"handshake at the {right} door: {_FAILURES[number]}"
+        if number == _UNLISTED:
+            why = f"our key {own} is not on its list; allow it there with advnerf car keys allow {own} --right {right}"
+        else:
+            why = f"the handshake failed; advnerf car keys list must show the same key {peer} on both hosts"
+        return f"at the {right} door of {peer}: {why}"
 
     def _arm_curve(self, socket: zmq.Socket[Any], right: str) -> None:
         keys, own = self._config.keys, self._config.own

@@ -11,10 +11,13 @@ from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import Now
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import header, types
+from nodes.runtime.node import FAULT
 from nodes.runtime.requests import RequestIdentity
+from nodes.runtime.topics import status_topic
 
 ARM, STATE, SENT = "/arm", "/safety/state", "/motor/sent"
 OPERATOR = "operator"
+GATEWAY_STATUS = status_topic("gateway")
 _REPEAT_S = 0.02
 _ARM_PATIENCE_S = 2.0
 BRAKE_WAIT_S = 0.3
@@ -48,26 +51,37 @@ def arm_message(asked: RequestIdentity, now: Now, arm: bool, source: str, reason
     )
 
 
+def gateway_trouble(status: Received) -> str:
+    """Say what a status of the gateway reports about the way to a safety node on another host; empty if nothing is wrong."""
+    message = status.message()
+    return f"The gateway reports: {message.text}" if message.state == FAULT else ""
+
+
 def ask_to_arm(run_dir: Path, reason: str) -> ArmAnswer:
     """Ask the safety node to arm, as the operator.
 
     Raises:
-        LaunchError: The safety node did not answer.
+        LaunchError: The safety node did not answer. On a host without one, it says what the gateway reports about the way there.
     """
+    advice = "Check that the node is running"
 
     def make(asked: RequestIdentity, now: Now) -> Any:
         return arm_message(asked, now, True, OPERATOR, reason)
 
     def read(ask_id: str, received: Received) -> Received | None:
+        nonlocal advice
+        if received.topic == GATEWAY_STATUS:
+            advice = gateway_trouble(received) or advice
         return received if received.topic == STATE and received.message().answered_id == ask_id else None
 
     with Bus(run_dir) as bus:
+        bus.subscribe(GATEWAY_STATUS)
         try:
             answered = ask(bus, ARM, make, STATE, read, every_s=_REPEAT_S, patience_s=_ARM_PATIENCE_S)
         except NoAnswerError:
             raise LaunchError(
-                f"expected an answer from the safety node within {_ARM_PATIENCE_S:g} s, got none; the car may be armed."
-                " Check that the node is running. To be safe, run advnerf disarm"
+                f"expected an answer from the safety node within {_ARM_PATIENCE_S:g} s, got none; the car may be armed. "
+                f"{advice}. To be safe, run advnerf disarm"
             ) from None
     state = answered.message()
     text = str(state.source if state.armed else state.reason) if state.granted else str(state.answer)

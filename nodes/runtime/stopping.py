@@ -11,7 +11,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from nodes.runtime.arm_requests import ARM, BRAKE_WAIT_S, OPERATOR, SENT, STATE, ArmAnswer, arm_message
+from nodes.runtime.arm_requests import (
+    ARM,
+    BRAKE_WAIT_S,
+    GATEWAY_STATUS,
+    OPERATOR,
+    SENT,
+    STATE,
+    ArmAnswer,
+    arm_message,
+    gateway_trouble,
+)
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import MessageError
@@ -29,12 +39,14 @@ class StopReport:
         waited_s: Time since the first request [s].
         answer: Answer of the safety node; None before it answers.
         trouble: Why the request cannot be sent; empty if it can.
+        gateway: What the gateway reports about the way to the safety node; empty if nothing is wrong.
     """
 
     run_dir: Path
     waited_s: float
     answer: ArmAnswer | None = None
     trouble: str = ""
+    gateway: str = ""
 
 
 class StopRequest:
@@ -50,10 +62,12 @@ class StopRequest:
         self._answered: Received | None = None
         self._answered_s = 0.0
         self._braked = False
+        self._gateway = ""
         self._bus = Bus(run_dir)
         try:
             self._bus.subscribe(STATE)
             self._bus.subscribe(SENT)
+            self._bus.subscribe(GATEWAY_STATUS)
             self._bus.publisher(ARM)
         except BaseException:
             self._bus.close()
@@ -80,7 +94,7 @@ class StopRequest:
         """Report the answer once it is complete: with the brake, or 0.3 s after the safety node's answer without it."""
         waited_s = time.monotonic() - self._began_s
         if self._answered is None or not (self._braked or time.monotonic() - self._answered_s > BRAKE_WAIT_S):
-            return StopReport(self.run_dir, waited_s)
+            return StopReport(self.run_dir, waited_s, gateway=self._gateway)
         state = self._answered.message()
         answer = ArmAnswer(bool(state.granted), bool(state.armed), str(state.reason), self._braked)
         return StopReport(self.run_dir, waited_s, answer)
@@ -96,6 +110,8 @@ class StopRequest:
         if received.topic == STATE and self._answered is None:
             if received.message().answered_id == self._asked.ask_id:
                 self._answered, self._answered_s = received, time.monotonic()
+        elif received.topic == GATEWAY_STATUS:
+            self._gateway = gateway_trouble(received)
         elif received.topic == SENT and self._answered is not None:
             since_ns = self._answered.info.publish_mono_ns
             self._braked |= received.info.publish_mono_ns >= since_ns and bool(received.message().braking)

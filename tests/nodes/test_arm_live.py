@@ -1,6 +1,7 @@
 """Requests to arm and to disarm on real sockets: a real safety process, a recorder as the only subscriber, late and restarted nodes."""
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -13,7 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nodes.gateway import GatewayConfig, GatewayNode
 from nodes.launching.running import has_ended
+from nodes.linking.keys import KeyFolder
 from nodes.runtime.arm_requests import arm_message, ask_to_arm
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
@@ -22,6 +25,7 @@ from nodes.runtime.messages import drive_message, header, pose_message, types
 from nodes.runtime.paths import RESOLVED_NAME
 from nodes.runtime.requests import RequestIdentity
 from tests.support.disarm import ask_to_disarm
+from tests.support.live.processes import free_ports
 from tests.support.messages import filled
 from tests.support.waiting import wait_for
 
@@ -192,6 +196,43 @@ def test_why_it_is_not_armed(lab):
     named, answer = output.splitlines()
     assert named == f"{lab.folder}: no motor node on this host"
     assert answer.startswith("not armed: no pose of the car for ")
+
+
+def test_what_the_gateway_reports_is_added_where_no_safety_node_answers(lab):
+    keys = KeyFolder(lab.folder / "keys")
+    keys.new("robot")
+    watch_port, drive_port = free_ports(2)
+    common = {"watch_port": watch_port, "drive_port": drive_port, "keys": keys.path}
+    car = GatewayNode(GatewayConfig(listen="127.0.0.1", imports=("/arm",), **common), lambda topic: 0)
+    config = GatewayConfig(connect="127.0.0.1", exports=("/arm",), **common)
+    settings = [
+        part
+        for name, value in config.model_dump(mode="json").items()
+        for part in ("--set", f"{name}={json.dumps(value)}")
+    ]
+    program = [sys.executable, "-m", "nodes.gateway", "--folder", str(lab.folder), "--name", "gateway"]
+    gateway = subprocess.Popen([*program, *settings])
+    told = "The gateway reports: refused at the drive door of robot: our key robot is not on its list; allow it there"
+    try:
+        wait_for(lambda: told in why_not_armed(lab), "the gateway's report")
+        assert "run advnerf disarm" in why_not_armed(lab)
+        asking = command(lab, "disarm")
+        wait_for(lambda: told in asking.stderr.readline(), "the gateway's report")
+        asking.send_signal(signal.SIGINT)
+        assert asking.wait(120) == 130
+        asking.stdout.close()
+        asking.stderr.close()
+    finally:
+        gateway.terminate()
+        gateway.wait()
+        car.close()
+        car.inbox.close()
+
+
+def why_not_armed(lab):
+    with pytest.raises(LaunchError) as failure:
+        ask_to_arm(lab.folder, "")
+    return str(failure.value)
 
 
 def test_a_hung_safety_node_answers_when_it_wakes_and_an_arm_is_void_by_then(lab):

@@ -261,6 +261,40 @@ def test_revocation_ends_a_running_connection(lab):
     assert drives(lab.run(60.0, drives, hello(workstation)))
 
 
+def test_a_host_that_is_refused_says_by_which_door_and_what_to_do_and_counts_nothing_as_sent(lab, capfd):
+    lab.robot()
+    workstation = lab.workstation()
+    assert lab.run(60.0, drives, hello(workstation))
+    lab.keys["robot"].allow("workstation", WATCH)
+    told = (
+        "fault",
+        "refused at the drive door of robot: our key workstation is not on its list; "
+        "allow it there with advnerf car keys allow workstation --right drive",
+    )
+    lab.run(60.0, lambda got: workstation.node.status() == told, hello(workstation))
+    before = workstation.node.counters()["sent"]
+    lab.run(2.0, act=hello(workstation))
+    assert (workstation.node.status(), workstation.node.counters()["sent"]) == (told, before)
+    said = capfd.readouterr().err
+    assert f"link: {told[1]}" in said
+    assert "link: refused handshake at the drive door: its key is not on the list" in said
+
+    lab.keys["robot"].allow("workstation", DRIVE)
+    assert drives(lab.run(60.0, drives, hello(workstation)))
+    assert workstation.node.status()[0] == "active"
+
+
+def test_a_host_that_knows_another_key_of_the_car_says_what_to_compare(lab):
+    lab.robot()
+    lab.keys["visitor"].path.joinpath("public", "robot.pub").write_bytes(zmq.curve_keypair()[0])
+    visitor = lab.workstation("visitor", exports=())
+    lab.run(60.0, lambda got: visitor.node.status()[0] == "fault")
+    assert visitor.node.status()[1] == (
+        "refused at the watch door of robot: the handshake failed; "
+        "advnerf car keys list must show the same key robot on both hosts"
+    )
+
+
 @contextlib.contextmanager
 def no_descriptor_left():
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
