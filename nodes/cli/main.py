@@ -141,7 +141,9 @@ def launch(
     from nodes.launching.launch import Launch
     from nodes.launching.launch_file import load_launch
 
-    plan = load_launch(file, overrides or [], host=host)
+    # As text: the folder is made only when the checks have passed.
+    place = "<run_dir>" if run_dir is None else str(run_dir.resolve())
+    plan = load_launch(file, overrides or [], place, host)
     say_code(plan.resolved, file.parent)
     if check:
         _print_plan(plan)

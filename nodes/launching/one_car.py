@@ -24,12 +24,13 @@ def mixtures(plan: Plan) -> dict[str, str]:
         document.data.get("calibration"),
         f"{plan.run_dir}/{PORT}",
     )
-    if twin is not None and port != twins:
+    on_twin = _placed(port) == _placed(twins)
+    if twin is not None and not on_twin:
         found[motor] = (
             f"{document.place(('port',))}: expected {motor}.port {twins} beside the node {twin}, got {port}: a real car would drive by simulated poses; "
             f"set {twin}.if=false, or leave the port"
         )
-    elif port != twins and _method(vehicle) == BY_CONSTRUCTION:
+    elif not on_twin and _method(vehicle) == BY_CONSTRUCTION:
         found[motor] = (
             f"{document.place(('calibration',))}: expected a measured {motor}.calibration for the controller at {port}, got {vehicle}, the simulated car's; "
             "set params.calibration to the folder of what was measured"
@@ -41,6 +42,11 @@ def mixtures(plan: Plan) -> dict[str, str]:
             "limits of one car do not hold for another"
         )
     return found
+
+
+def _placed(port: str) -> Path:
+    """A port in its resolved folder. The port itself may be a link, to another pseudo-terminal at each start."""
+    return Path(port).parent.resolve() / Path(port).name
 
 
 def _method(vehicle: object) -> str:

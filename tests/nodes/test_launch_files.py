@@ -1,6 +1,8 @@
 """The shipped launch files: they resolve, and each node of a real car takes the configuration that is meant for it."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -112,6 +114,25 @@ def test_a_car_that_was_measured_is_one_car(tmp_path):
         (tmp_path / file.name).write_text(file.read_text().replace("by construction", "measured"))
     real = ["twin.if=false", "motor.port=/dev/vesc", f"params.calibration={tmp_path}"]
     assert mixtures(load_launch(LAUNCH / "green_screen.launch.yaml", real)) == {}
+
+
+@pytest.mark.parametrize("check", [["--check"], []])
+def test_the_port_of_a_twin_in_the_runs_folder_may_be_given_as_a_path(check, tmp_path):
+    folder, link = tmp_path / "run", tmp_path / "link"
+    link.symlink_to(tmp_path)
+    program = [sys.executable, "-m", "nodes.cli", "launch", LAUNCH / "green_screen.launch.yaml", *check]
+
+    def said(port):
+        settings = ["--set", "twin.if=false", "--set", f"motor.port={port}", "--folder", folder]
+        done = subprocess.run(
+            [*program, *settings], capture_output=True, text=True, cwd=tmp_path, timeout=600
+        )
+        assert (done.returncode, folder.exists()) == (2, False)
+        return done.stderr
+
+    assert "expected a measured motor.calibration for the controller at" in said(tmp_path / "vesc")
+    for port in (folder / "vesc", "run/vesc", link / "run" / "vesc"):
+        assert said(port).startswith("error: policy: expected a policy file at")
 
 
 @pytest.mark.parametrize("file", ["ros2", "ros2_car"])
