@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from heapq import merge
 from operator import itemgetter
 from pathlib import Path
+from typing import TypeVar
 
 from mcap.records import Channel
 
@@ -32,6 +33,8 @@ from nodes.bags.whole import FileSummary, read_summary
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
 from nodes.runtime.topics import type_of_topic
+
+T = TypeVar("T")
 
 
 def read_info(bag: Path) -> BagInfo:
@@ -254,13 +257,7 @@ def _sum(one: TopicInfo, other: TopicInfo) -> TopicInfo:
 
 
 def _parts(bag: Path) -> list[FileInfo]:
-    found = []
-    for path in bag_parts(bag):
-        state = path.stat()
-        if (part := _part_of(path, state.st_mtime_ns, state.st_size)) is None:
-            raise _unfinished(path)
-        found.append(part)
-    return found
+    return [_finished(path, _part_of) for path in bag_parts(bag)]
 
 
 @lru_cache(maxsize=1024)
@@ -311,10 +308,7 @@ def _recorded(summary: FileSummary, channel: Channel) -> RecordedTopic:
 
 
 def _whole_file(path: Path) -> FileSummary:
-    state = path.stat()
-    if (found := _summary_of(path, state.st_mtime_ns, state.st_size)) is None:
-        raise _unfinished(path)
-    return found
+    return _finished(path, _summary_of)
 
 
 @lru_cache(maxsize=1024)
@@ -323,9 +317,19 @@ def _say_unchecked(path: Path, reason: str) -> None:
     print(f"{path}: unchecked: {reason}, so damage to it cannot be noticed", file=sys.stderr, flush=True)
 
 
-def _unfinished(path: Path) -> BagError:
-    """Error about an unfinished file, with advice that depends on its contents."""
-    return BagError(f"{path} is unfinished: its recorder was killed; {'; '.join(diagnose(path)[-2:])}")
+def _finished(path: Path, read: Callable[[Path, int, int], T | None]) -> T:
+    """Read a file as it is now, and once more if its recorder has finished it meanwhile.
+
+    Raises:
+        BagError: It is being written, or was left unfinished; with advice that depends on its contents.
+    """
+    for _ in range(2):
+        state = path.stat()
+        if (found := read(path, state.st_mtime_ns, state.st_size)) is not None:
+            return found
+        if lines := diagnose(path):
+            break
+    raise BagError(f"{path} is unfinished: its recorder was killed; {'; '.join(lines[-2:])}")
 
 
 @lru_cache(maxsize=4)

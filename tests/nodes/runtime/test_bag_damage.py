@@ -34,6 +34,7 @@ from tests.support.bag_damage import (
     reachable,
 )
 from tests.support.bag_samples import START_NS, write_all_topics
+from tests.support.waiting import wait_for
 
 
 @pytest.fixture(scope="module")
@@ -355,6 +356,23 @@ def test_a_file_that_is_being_written_is_left_alone(tmp_path):
         with pytest.raises(BagError, match="is being written at this moment"):
             read_info(writer.path)
     assert repair(writer.path).was_whole
+
+
+def test_a_file_that_its_recorder_finishes_while_it_is_read_was_not_left_unfinished(tmp_path):
+    writer = BagWriter(tmp_path / "bag")
+    writer.write("/vicon/car", b"x" * 100, START_NS, START_NS, 0)
+    writer.flush()
+    threading.Timer(0.2, writer.close).start()  # a reader asks for half a second whether it is still written
+
+    def read():
+        try:
+            return read_info(writer.path)
+        except BagError as error:
+            if "is being written at this moment" not in str(error):
+                raise
+            return None
+
+    assert wait_for(read, "the end of the recording").messages == 1
 
 
 def test_a_copy_of_the_file_that_a_starting_process_has_for_a_moment_is_no_writer(tmp_path):
