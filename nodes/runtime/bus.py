@@ -24,11 +24,11 @@ import zmq
 
 from nodes.runtime.clock import NS_PER_S, Clock, SystemClock
 from nodes.runtime.descriptors import require_free
-from nodes.runtime.errors import BusError, MessageError
+from nodes.runtime.errors import BusError, MessageError, TakenError
 from nodes.runtime.image_parts import IMAGE_TYPE, PartedInfo, join_image, split_image, with_parts
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.messages import MAX_SEQUENCE_LENGTH, decode, encode, type_hash_prefix, type_name
-from nodes.runtime.paths import lock_path, socket_path
+from nodes.runtime.paths import bus_folder, lock_path, socket_path
 from nodes.runtime.topics import STATUS_PREFIX, Topic
 from nodes.runtime.topics import topic as topic_row
 from nodes.runtime.wire import MessageInfo, Meta, Relayed, pack_meta, unpack_parts
@@ -410,7 +410,7 @@ def _bind(socket: zmq.Socket[Any], run_dir: Path, topic: Topic) -> TextIO:
                     f"cannot open {topic.name} at {path}: {error.strerror}; check the run folder"
                 ) from error
             return lock
-        raise BusError(_taken(topic, run_dir, owners))
+        raise TakenError(_taken(topic, run_dir, owners))
     except BaseException:
         socket.close()
         raise
@@ -422,7 +422,25 @@ def _taken(topic: Topic, run_dir: Path, owners: list[str]) -> str:
             f"expected at most {topic.receivers} processes that receive {topic.name} in {run_dir}, got another one beside process "
             f"{', '.join(owners)}; stop one of them"
         )
+    taken = f"{topic.name} is already published in {run_dir} by"
+    nodes = [name for owner in owners for name in _nodes_of(run_dir, owner)]
+    if nodes and not topic.name.startswith(STATUS_PREFIX):
+        return (
+            f"{taken} the node {', '.join(nodes)} (process {', '.join(owners)}). Leave the topic out here (bag play: --topics, --remap), "
+            f"start the launch without that node (--set {nodes[0]}.if=false), or use another --folder"
+        )
     return (
-        f"{topic.name} is already published in {run_dir} by process {', '.join(owners)}: another launch uses the same endpoints. "
+        f"{taken} process {', '.join(owners)}: another launch uses the same endpoints. "
         "Stop it, or use another --folder"
     )
+
+
+def _nodes_of(run_dir: Path, process: str) -> list[str]:
+    """Names of the nodes whose status a process publishes."""
+    prefix = socket_path(run_dir, STATUS_PREFIX + "x").name[:-1]
+    locks = sorted(bus_folder(run_dir).glob(f"{prefix}*.lock"))
+    return [
+        lock.stem.removeprefix(prefix)
+        for lock in locks
+        if lock.read_text(encoding="ascii", errors="replace").strip() == process
+    ]

@@ -25,6 +25,10 @@ class BusError(RuntimeFault, OSError):
     """An endpoint cannot be used."""
 
 
+class TakenError(BusError):
+    """Other processes have all endpoints of a topic."""
+
+
 class SecurityError(RuntimeFault):
     """A key is missing, unsafe or unknown, or an address may not be used without one."""
 

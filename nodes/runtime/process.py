@@ -19,7 +19,7 @@ from advnerf_core.errors import AdvnerfError
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.config import load_node_config
-from nodes.runtime.errors import BagError, ConfigError, NodeFinished, TopicError
+from nodes.runtime.errors import BagError, ConfigError, NodeFinished, TakenError, TopicError
 from nodes.runtime.loop import NodeLoop
 from nodes.runtime.node import FAULT, STARTING, Node, NodeContext
 from nodes.runtime.prepare import prepare_process
@@ -72,8 +72,8 @@ def run_node(
         on_loop: Called with the loop before it runs, so that a test can stop it.
 
     Returns:
-        Exit code: 0 after a regular end, 1 after a fault (one line on stderr, traceback in ``<run_dir>/logs``), 2 if the node
-        cannot be built with this configuration (one line on stderr).
+        Exit code: 0 after a regular end, 1 after a fault (one line on stderr, traceback in ``<run_dir>/logs`` unless a topic is
+        taken), 2 if the node cannot be built with this configuration (one line on stderr).
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     signals = _Signals() if in_main_thread else None
@@ -130,8 +130,11 @@ class _Runner:
             print(f"{self._name}: {_one_line(error)}", file=sys.stderr, flush=True)
             return
         self.exit_code = 1
-        log = self._run_dir / "logs" / f"{self._name}.traceback.txt"
         line = f"{self._name}: {_one_line(error)}"
+        if self.loop is None and isinstance(error, TakenError):  # it says everything
+            print(line, file=sys.stderr, flush=True)
+            return
+        log = self._run_dir / "logs" / f"{self._name}.traceback.txt"
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
             log.write_text("".join(traceback.format_exception(error)), encoding="utf-8")

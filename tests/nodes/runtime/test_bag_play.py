@@ -69,6 +69,32 @@ class Bench:
         return self.node.handle("/player/control", control(text, ask_id), None, self.clock.now())
 
 
+def test_a_topic_that_a_node_of_the_launch_publishes_is_told_in_one_line_with_that_node(bag, tmp_path):
+    program = [
+        sys.executable,
+        "-m",
+        "nodes.cli",
+        "bag",
+        "play",
+        str(bag),
+        "--no-wait",
+        "--folder",
+        str(tmp_path),
+    ]
+    with Bus(tmp_path) as node:
+        node.publisher("/status/vicon")
+        node.publisher("/vicon/car")
+        done = subprocess.run(program, capture_output=True, text=True, timeout=600)
+        assert done.returncode == 1
+        assert done.stderr == (
+            f"bag_play: /vicon/car is already published in {tmp_path} by the node vicon (process {os.getpid()}). Leave the topic out here "
+            "(bag play: --topics, --remap), start the launch without that node (--set vicon.if=false), or use another --folder\n"
+        )
+        assert not (tmp_path / "logs").exists()
+        again = [*program, "--rate", "100", "--remap", "/vicon/car:=/vicon/board"]
+        assert subprocess.run(again, timeout=600).returncode == 0
+
+
 def test_pause_holds_the_recording_and_resume_goes_on_where_it_was(bag):
     bench = Bench(bag)
     assert len(bench.run(0.5)) == 25
