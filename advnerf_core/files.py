@@ -133,7 +133,7 @@ def read_tensors(
 
     Raises:
         OSError: The file cannot be opened.
-        ValueError: It is damaged, or has no tensor of a name.
+        ValueError: It is damaged, has no tensor of a name, or one of a type that the framework lacks.
         PlaceError: The path is not UTF-8, which the library would take for a damaged file.
     """
     from safetensors import SafetensorError, safe_open
@@ -144,5 +144,5 @@ def read_tensors(
             return file.metadata() or {}, {
                 name: file.get_tensor(name) for name in (file.keys() if names is None else names)
             }
-    except SafetensorError as error:
+    except (SafetensorError, TypeError, AttributeError) as error:  # NumPy lacks types that torch has
         raise ValueError(str(error)) from error

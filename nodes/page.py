@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,8 @@ class PageNode(Node):
         room = None if config.room is None else load_calibration(RoomCalibration, config.room)
         nodes = launched.nodes if config.nodes is None else config.nodes
         self._catalogue, self._left_out = read_catalogue(config.attacks)
+        for line in self._left_out:  # the status has room for one
+            print(f"page: {line}", file=sys.stderr, flush=True)
         self._board = ViewState(room, nodes)
         self._view: PolicyView | None = view_of_policy(config.policy)
         self._operates = config.role == "operate"

@@ -39,19 +39,24 @@ def read_catalogue(places: Iterable[Path]) -> tuple[dict[str, CatalogueEntry], l
         places: Attack files, and folders whose attack files are read, without their subfolders.
 
     Returns:
-        The attacks with a face, by id, and a line for each file that is left out.
+        The attacks with a face, by id, and a line for each file that is left out and each folder without any.
     """
     entries: dict[str, CatalogueEntry] = {}
-    left_out = []
+    left_out = list[str]()
     for place in places:
-        files = sorted(place.glob(f"*attack*{_SUFFIX}")) if place.is_dir() else [place]
+        files, told = sorted(place.glob(f"*{_SUFFIX}")) if place.is_dir() else [place], list[str]()
         for file in files:
             try:
                 entry = _entry(load_attack(file), file)
             except AttackFileError as error:
-                left_out.append(f"{file.name}: {error}")
+                told.append(f"{file.name}: {error}")
                 continue
             entries[entry.attack_id] = entry
+        if place.is_dir() and len(told) == len(files):
+            left_out.append(
+                f"{place}: expected attack files (*{_SUFFIX}), found none; correct the folder, or name the files"
+            )
+        left_out += told
     return entries, left_out
 
 

@@ -4,6 +4,7 @@ import json
 import re
 import signal
 import time
+from pathlib import Path
 
 import pytest
 
@@ -395,6 +396,44 @@ def test_off_the_machine_there_is_tls_and_a_code(tmp_path):
         assert json.loads(request(port, "/session", {"Cookie": token}, tls=True)[2])["open"] is True
     finally:
         run.close()
+
+
+def test_a_folder_of_attacks_may_name_them_by_their_ids_and_says_what_is_none(tmp_path):
+    import torch
+    from safetensors.torch import save_file
+
+    from nodes.operator_page.catalogue import read_catalogue
+
+    published = Path(__file__).parents[3] / "docs" / "results" / "paper_monitor" / "attacks"
+    entries, left_out = read_catalogue([published])
+    assert {file.stem for file in published.iterdir()} == {entry.facts["name"] for entry in entries.values()}
+    assert left_out == []
+    (tmp_path / "empty").mkdir()
+    for name, kind, form in (
+        ("network", torch.bfloat16, None),
+        ("policy", torch.float32, "advnerf-policy-1"),
+        ("scene", torch.uint8, "advnerf-scene-2"),
+    ):
+        file = tmp_path / f"{name}.safetensors"
+        save_file({"w": torch.zeros(4, dtype=kind)}, file, form and {"format": form})
+    run = Run(tmp_path, attacks=[str(tmp_path), str(tmp_path / "empty"), str(tmp_path / "none.safetensors")])
+    try:
+        run.start()
+        said = [
+            line for line in (tmp_path / "page.log").read_text().splitlines() if line.startswith("page: ")
+        ]
+    finally:
+        run.close()
+    begins = [
+        f"page: {tmp_path}: expected attack files (*.safetensors), found none; correct the folder",
+        f"page: network.safetensors: cannot read {tmp_path}/network.safetensors as an attack file",
+        "page: policy.safetensors: expected",
+        "page: scene.safetensors: expected",
+        f"page: {tmp_path / 'empty'}: expected attack files (*.safetensors), found none; correct the folder",
+        f"page: none.safetensors: expected an attack file at {tmp_path}/none.safetensors, found none",
+    ]
+    assert [line[: len(begin)] for line, begin in zip(said, begins, strict=True)] == begins
+    assert said[2].endswith("got 'advnerf-policy-1'")
 
 
 def test_an_attack_is_chosen_and_switched_off(tmp_path):
