@@ -94,10 +94,13 @@ class KeyFolder:
             raise SecurityError(
                 f"{name} has another key in {known}; revoke {name} and remove that file first"
             )
-        if other := next(
-            (row.name for row in self.rows() if row.public == public and row.name != name), None
-        ):
-            raise SecurityError(f"this public key is known as {other}; allow or revoke {other}")
+        if other := next((row for row in self.rows() if row.public == public and row.name != name), None):
+            if other.ours:
+                raise SecurityError(
+                    f"expected the public key of {name}, got {other.name}, a key of this host itself; give the one that advnerf car keys new {name} "
+                    "printed on the other host"
+                )
+            raise SecurityError(f"this public key is known as {other.name}; allow or revoke {other.name}")
         write_atomically(known, public + "\n")
 
     def allow(self, name: str, right: str) -> tuple[str, ...]:

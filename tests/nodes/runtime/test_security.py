@@ -166,15 +166,20 @@ def test_rights_are_separate_and_can_be_taken_back(tmp_path):
     for ask in (keys.allow, keys.revoke):
         with pytest.raises(SecurityError, match="expected the right watch or drive, got drvie"):
             ask("alice", "drvie")
-    with pytest.raises(SecurityError, match="this public key is known as alice"):
-        keys.add("alice2", public)
+    keys.add("bob", zmq.curve_keypair()[0].decode())
+    with pytest.raises(SecurityError, match="this public key is known as bob; allow or revoke bob"):
+        keys.add("carol", keys.public("bob"))
+    with pytest.raises(
+        SecurityError, match="expected the public key of carol, got alice, a key of this host"
+    ):
+        keys.add("carol", public)
     keys.revoke("alice")
     with pytest.raises(SecurityError, match="has no such right"):
         keys.revoke("alice")
     with pytest.raises(SecurityError, match="expected a public key at"):
-        keys.allow("bob", WATCH)
+        keys.allow("carol", WATCH)
     with pytest.raises(SecurityError, match="40 Z85 characters"):
-        keys.add("bob", "short")
+        keys.add("carol", "short")
 
 
 def test_an_address_for_all_without_keys_is_refused(tmp_path):
