@@ -29,6 +29,10 @@ from nodes.runtime.findings import NotMet
 
 # Predicted depth may be off by this share, and colour by this much [grey levels, and of the picture's spread]; points on edges and behind others are.
 _SAME_DEPTH, _LEAST_AGREEMENT, _BETTER_BY = 0.02, 0.75, 0.1
+# Of the upper part only depth counts, of what the other view does not hide: it is far away, where colours are fine and objects cover each other.
+_LEAST_UPPER = 0.85
+# A largest depth that so many pixels have to the bit, before the car moves ahead and after, is no surface.
+_SATURATED_SHARE = 0.01
 _SAME_COLOUR, _SAME_COLOUR_SHARE = 4.0, 0.2
 _EVERY_PX = 3
 # The second view of a pair: ahead by this many seconds of driving, aside by a share of half a lane, turned [rad].
@@ -70,6 +74,8 @@ class CameraView:
 def views_agree(bench: WorldBench) -> str:
     """Points from depth at one pose of the car have the same place and colour from another pose."""
     pairs = _pairs_of_views(bench)
+    for one, ahead in pairs[0]:
+        _require_unsaturated(one.depth, ahead.depth)
     readings = _readings(bench)
     shares = [_agreement(reading, pairs, bench.world.camera_pinhole) for reading in readings]
     best = int(np.argmax(shares))
@@ -82,6 +88,13 @@ def views_agree(bench: WorldBench) -> str:
         raise NotMet(
             f"expected points seen from two poses to be in one place; {100 * shares[0]:.0f} % are (at least {100 * _LEAST_AGREEMENT:.0f} % will do): "
             "compare T_car_from_camera and camera_pinhole with the camera that draws, and the pose with the one asked for"
+        )
+    upper = _upper_agreement(readings[0], pairs, bench.world.camera_pinhole)
+    if upper < _LEAST_UPPER:
+        raise NotMet(
+            f"expected points in the upper half of the picture, seen from two poses, to be in one place; {100 * upper:.0f} % are (at least "
+            f"{100 * _LEAST_UPPER:.0f} % will do), and {100 * shares[0]:.0f} % in the lower half: is depth right in every row, and far away? give infinity "
+            "where nothing is measured"
         )
     return f"{100 * shares[0]:.0f} % of the points seen from two poses are in one place, within {100 * _SAME_DEPTH:.0f} % of their distance and of one colour"
 
@@ -265,34 +278,65 @@ def _agreement(reading: Reading, pairs: list[list[tuple[CameraView, CameraView]]
 
 def _in_one_place(reading: Reading, one: CameraView, other: CameraView, pinhole: Pinhole) -> tuple[int, int]:
     """Number of points of a view's lower part whose depth and colour agree with the other view, and number of points within the other view."""
-    directions = pinhole.directions()
     # The ground and objects on it.
-    below = slice(pinhole.height // 2, None, _EVERY_PX), slice(None, None, _EVERY_PX)
-    z_m = np.asarray(reading.seen(reading.planar(one.depth, directions)), dtype=np.float64)[below]
+    nearness, same_colour = _seen_again(reading, one, other, pinhole, slice(pinhole.height // 2, None))
+    return int(np.sum((np.abs(nearness - 1.0) < _SAME_DEPTH) & same_colour)), len(nearness)
+
+
+def _upper_agreement(
+    reading: Reading, pairs: list[list[tuple[CameraView, CameraView]]], pinhole: Pinhole
+) -> float:
+    """Share of points of the upper part with the same place from both poses, for the kind of move with the lowest share; 1 if nothing is seen there."""
+    shares, upper = [1.0], slice(None, pinhole.height // 2)
+    for kind in pairs:
+        found = np.concatenate([_seen_again(reading, one, other, pinhole, upper)[0] for one, other in kind])
+        shown = found[found < 1.0 + _SAME_DEPTH]  # others are behind something
+        if len(found):
+            shares.append(float(np.sum(shown > 1.0 - _SAME_DEPTH)) / max(len(shown), 1))
+    return min(shares)
+
+
+def _seen_again(
+    reading: Reading, one: CameraView, other: CameraView, pinhole: Pinhole, rows: slice
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Points of some rows of a view that are within the other view: depth there relative to what the other view has, and whether colours agree."""
+    directions = pinhole.directions()
+    part = slice(rows.start, rows.stop, _EVERY_PX), slice(None, None, _EVERY_PX)
+    z_m = np.asarray(reading.seen(reading.planar(one.depth, directions)), dtype=np.float64)[part]
     known = np.isfinite(z_m) & (z_m > 0.0)
-    colour = reading.seen(one.rgb)[below][known]
+    colour = reading.seen(one.rgb)[part][known]
     T_other_from_one = (
         invert_transform(planar_pose(*reading.pose(other.pose)) @ reading.mount)
         @ planar_pose(*reading.pose(one.pose))
         @ reading.mount
     )
-    there = transform_points(T_other_from_one, directions[below][known] * z_m[known][:, None])
+    there = transform_points(T_other_from_one, directions[part][known] * z_m[known][:, None])
     pixels = pinhole.project(there)
     inside = (there[:, 2] > 0.0) & (pixels > 1.0).all(axis=1)
     inside &= (pixels < [pinhole.width - 1.0, pinhole.height - 1.0]).all(axis=1)
     if not inside.any():
-        return 0, 0
+        return np.zeros(0), np.zeros(0, dtype=bool)
     # On a plane the inverse of depth is linear in the picture.
     other_depth = np.asarray(reading.seen(reading.planar(other.depth, directions)), dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(other_depth > 0.0, 1.0 / other_depth, 0.0).astype(np.float32)
     maps = (pixels[inside] - 0.5).astype(np.float32)
-    same_depth = np.abs(there[inside, 2] * _sampled(inverse, maps) - 1.0) < _SAME_DEPTH
     apart = np.abs(colour[inside] - _sampled(np.ascontiguousarray(reading.seen(other.rgb)), maps)).mean(
         axis=1
     )
     same_colour = apart < max(_SAME_COLOUR, _SAME_COLOUR_SHARE * float(other.rgb.std(axis=(0, 1)).mean()))
-    return int(np.sum(same_depth & same_colour)), len(maps)
+    return there[inside, 2] * _sampled(inverse, maps), same_colour
+
+
+def _require_unsaturated(here: Depth, ahead: Depth) -> None:
+    """Raise for views before and after a move ahead in which many pixels share one largest depth: a surface would have come nearer."""
+    farthest_m, also_m = (float(np.max(each, initial=0.0, where=np.isfinite(each))) for each in (here, ahead))
+    share = min(float(np.mean(each == farthest_m)) for each in (here, ahead))
+    if farthest_m == also_m and share > _SATURATED_SHARE:
+        raise NotMet(
+            f"expected infinite depth where nothing is measured; {100 * share:.0f} % of a view is at its largest depth, {farthest_m:g} m, and stays there as the "
+            "car drives ahead: the camera ends there; give infinity where nothing is measured"
+        )
 
 
 def _sampled(image: NDArray[np.float32], xy: NDArray[np.float32]) -> Array:

@@ -94,6 +94,19 @@ class Millimetres(Small):
         return rgb, 1000.0 * z if depth else None
 
 
+class SaturatedDepth(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = super().observe_at(*pose)
+        return rgb, np.minimum(z, np.float32(4.0)) if depth else None
+
+
+class HalfTheDepthAbove(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = super().observe_at(*pose)
+        z[: len(z) // 2] *= 0.5
+        return rgb, z if depth else None
+
+
 class LevelCamera(Small):
     def observe_at(self, *pose: float, depth: bool = True) -> Any:
         rgb, z = self._cast(planar_pose(*pose) @ camera_mount(0.4, 0.0, 0.5), self.camera_pinhole)
@@ -295,6 +308,8 @@ class Raises(Small):
         (UpsideDown, "camera", "upside down"),
         (DepthAlongTheRay, "camera", "distance along the ray"),
         (Millimetres, "camera", "in millimetres"),
+        (SaturatedDepth, "camera", "largest depth, 4 m"),
+        (HalfTheDepthAbove, "camera", "in the upper half of the picture"),
         (LevelCamera, "camera", "the camera that draws is level"),
         (CameraOnTheRearAxle, "camera", "compare T_car_from_camera"),
         (InverseMount, "camera", "inverse of what is meant"),
