@@ -15,13 +15,17 @@ class NotMet(Exception):
     """A part of the contract is not met; the text says what was expected, what was found, and what to change."""
 
 
+class MetButLook(Exception):
+    """A part of the contract is met, but with a number that a right plug-in does not have; the text says what was found, and what to look at."""
+
+
 @dataclass(frozen=True)
 class CheckFinding:
     """One line of the report.
 
     Attributes:
         name: What was checked, such as a part of a contract.
-        state: ``met`` or ``not met``; ``ok``, ``warning`` or ``failure`` where there is no contract.
+        state: ``met``, ``met, but look`` or ``not met``; ``ok``, ``warning`` or ``failure`` where there is no contract.
         text: The finding, with numbers; if it is not met also what to change.
     """
 
@@ -41,13 +45,15 @@ def look(
     """The finding of one check.
 
     Args:
-        check: Returns what was found, or raises `NotMet`.
+        check: Returns what was found, or raises `NotMet` or `MetButLook`.
         lets_through: Errors that end the whole report. Any other error is a part that is not met.
     """
     try:
         return CheckFinding(name, "met", check(bench))
     except NotMet as reason:
         return CheckFinding(name, "not met", str(reason))
+    except MetButLook as reason:
+        return CheckFinding(name, "met, but look", str(reason))
     except lets_through:
         raise
     except Exception as error:  # a plug-in may raise anything

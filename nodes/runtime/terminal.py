@@ -25,6 +25,7 @@ FAILURE_EXIT = 1
 
 _ADDRESS = re.compile(r"(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
 _LAST_PORT = 65535
+_COLOURS = {"warning": "yellow", "met, but look": "yellow", "failure": "red", "not met": "red"}
 _POLICY_FILES = (".safetensors", ".onnx", ".pt2")
 Overrides = Annotated[
     list[str] | None,
@@ -175,7 +176,7 @@ def print_findings(findings: Sequence[CheckFinding], what: str = "part") -> bool
     """Print what a check found, a line for each part that ``what`` names. Returns whether all of it is met."""
     rows = table(what, "state", "found")
     for finding in findings:
-        colour = {"warning": "yellow", "failure": "red", "not met": "red"}.get(finding.state, "green")
+        colour = _COLOURS.get(finding.state, "green")
         rows.add_row(finding.name, coloured(finding.state, colour), finding.text)
     print_table(rows)
     return all(finding.met for finding in findings)

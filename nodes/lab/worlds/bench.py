@@ -58,7 +58,7 @@ class WorldBench:
 
 
 Check = Callable[[WorldBench], str]
-"""Looks at one part of the contract: gives what was found, or raises `NotMet`."""
+"""Looks at one part of the contract: gives what was found, or raises `NotMet` or `MetButLook`."""
 
 
 def pose_of(state: VehicleState) -> Array:

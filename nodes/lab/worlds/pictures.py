@@ -12,13 +12,13 @@ from advnerf_core.geometry import Array, planar_pose
 from hardware.worlds.world import Rgb, require_depth, traits_of
 from nodes.lab.worlds.bench import WorldBench, pose_of
 from nodes.lab.worlds.held import require_depth_of, require_picture
-from nodes.runtime.findings import NotMet, form_of
+from nodes.runtime.findings import MetButLook, NotMet, form_of
 
 # Below this spread a picture counts as one colour [grey levels].
 _LEAST_SPREAD = 1.0
 _LEAST_DEPTH_SHARE = 0.3
 # A photograph and the driving camera's view from the same pose: correlation of their grey values, and mean difference [grey levels].
-_LEAST_CORRELATION, _LARGEST_DIFFERENCE = 0.85, 16.0
+_LEAST_CORRELATION, _CORRELATION_TO_LOOK_AT, _LARGEST_DIFFERENCE = 0.85, 0.97, 16.0
 _COLOURLESS = 3.0
 _LEAST_OVERLAP = 0.2
 # A picture after a step may differ by this share of the step's change, as the car's own body may be in it.
@@ -171,7 +171,12 @@ def photographs_match(bench: WorldBench) -> str:
         if np.mean(colour) < _COLOURLESS
         else "the same order of colours (whether that is red, green, blue only a look at -o tells)"
     )
-    return f"correlation {np.median(correlations):.3f}, difference {np.mean(plain):.1f} grey levels; {told}"
+    found = f"correlation {np.median(correlations):.3f}, difference {np.mean(plain):.1f} grey levels; {told}"
+    if np.median(correlations) < _CORRELATION_TO_LOOK_AT:
+        raise MetButLook(
+            f"{found}; a correlation below {_CORRELATION_TO_LOOK_AT:g} is unusual: look at both with -o, and at T_car_from_camera, camera_pinhole and photo_pinhole"
+        )
+    return found
 
 
 def _script(bench: WorldBench) -> list[tuple[str, NDArray[Any]]]:

@@ -10,6 +10,7 @@ import pytest
 from advnerf_core.documents import Document
 from advnerf_core.geometry import (
     OPENGL_FROM_OPENCV,
+    Pinhole,
     VehicleState,
     camera_mount,
     invert_transform,
@@ -44,7 +45,7 @@ def test_good_worlds_pass(kind: str, tmp_path: Any) -> None:
     findings = check_world(named(kind), tmp_path / "look")
     shows_panels = ["panels"] if kind == "lab" else []  # the only one of them with native panels
     assert [finding.name for finding in findings] == [*PARTS, *shows_panels]
-    assert [f"{finding.name}: {finding.text}" for finding in findings if not finding.met] == []
+    assert [f"{finding.name}: {finding.text}" for finding in findings if finding.state != "met"] == []
     views = len(findings[0].text.split("paths ")[1].split("), "))
     assert len(list((tmp_path / "look").glob("*.png"))) == 3 * views
 
@@ -64,7 +65,7 @@ class Small(Warehouse):  # type: ignore[misc]
 
 def test_the_small_warehouse_passes() -> None:
     assert [
-        f"{finding.name}: {finding.text}" for finding in check_world(small(Small)) if not finding.met
+        f"{finding.name}: {finding.text}" for finding in check_world(small(Small)) if finding.state != "met"
     ] == []
 
 
@@ -111,6 +112,31 @@ class LevelCamera(Small):
     def observe_at(self, *pose: float, depth: bool = True) -> Any:
         rgb, z = self._cast(planar_pose(*pose) @ camera_mount(0.4, 0.0, 0.5), self.camera_pinhole)
         return rgb, z if depth else None
+
+
+class CameraFurtherAhead(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        T = camera_mount(0.55, 0.0, 0.5, math.radians(10.0))
+        rgb, z = self._cast(planar_pose(*pose) @ T, self.camera_pinhole)
+        return rgb, z if depth else None
+
+
+class ShortLens(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        p = self.camera_pinhole
+        lens = Pinhole(p.width, p.height, 0.95 * p.fx, 0.95 * p.fy, p.cx, p.cy)
+        rgb, z = self._cast(planar_pose(*pose) @ self.T_car_from_camera, lens)
+        return rgb, z if depth else None
+
+
+class DrivesSlowly(Small):
+    def step(self, wheel: float, speed: float, duration: float) -> VehicleState:
+        return super().step(wheel, 0.9 * speed, duration)
+
+
+class SteersTooLittle(Small):
+    def step(self, wheel: float, speed: float, duration: float) -> VehicleState:
+        return super().step(0.85 * wheel, speed, duration)
 
 
 class CameraOnTheRearAxle(Small):
@@ -310,6 +336,7 @@ class Raises(Small):
         (Millimetres, "camera", "in millimetres"),
         (SaturatedDepth, "camera", "largest depth, 4 m"),
         (HalfTheDepthAbove, "camera", "in the upper half of the picture"),
+        (ShortLens, "camera", "compare camera_pinhole with the camera that draws"),
         (LevelCamera, "camera", "the camera that draws is level"),
         (CameraOnTheRearAxle, "camera", "compare T_car_from_camera"),
         (InverseMount, "camera", "inverse of what is meant"),
@@ -344,6 +371,21 @@ class Raises(Small):
 def test_a_planted_fault_is_found_and_named(fault: Callable[..., Any], part: str, told: str) -> None:
     (finding,) = [each for each in check_world(small(fault), only=[part]) if each.name == part]
     assert not finding.met
+    assert told in finding.text
+
+
+@pytest.mark.parametrize(
+    ("fault", "part", "told"),
+    [
+        (CameraFurtherAhead, "camera", "look at T_car_from_camera and camera_pinhole"),
+        (CameraFurtherAhead, "photographs", "correlation below 0.97"),
+        (DrivesSlowly, "car", "speed x 0.90"),
+        (SteersTooLittle, "car", "turn x 0.85"),
+    ],
+)
+def test_a_small_fault_is_met_but_shown(fault: Callable[..., Any], part: str, told: str) -> None:
+    (finding,) = [each for each in check_world(small(fault), only=[part]) if each.name == part]
+    assert (finding.state, finding.met) == ("met, but look", True), finding.text
     assert told in finding.text
 
 
