@@ -14,6 +14,7 @@ from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.view_loading import load_image
 from advnerf_core.documents import Document, read_yaml
 from advnerf_core.geometry import Pinhole
+from advnerf_core.plugins import absolute_reference
 from advnerf_core.strict import validate
 from hardware.worlds.world import NativePanels, NotOpenError, WorldDescription
 from nodes.audit.asking import answer
@@ -171,7 +172,8 @@ class AuditedWorld:
         panels = isinstance(self._named.make(), NativePanels)
         path = path or next(iter(data.get("paths") or self.description.paths), "")
         base = _known_settings(self.name)
-        world = {**data["world"], "kind": self.name}
+        # The experiment file is in another folder than the one that the user is in.
+        world = {**data["world"], "kind": absolute_reference(self.name, Path.cwd())}
         return Place(self._named.kind, "world", self.name, "world", world, base, path, panels)
 
     @cached_property

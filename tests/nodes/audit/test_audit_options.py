@@ -28,9 +28,11 @@ from nodes.audit.question import AuditedQuestion, Place
 from nodes.cli.audit import PlaceOptions, _limit_m, _minutes
 from nodes.cli.main import app
 from nodes.experiment.show.experiment_world import as_json
+from nodes.experiment.steps.run import load_experiment
 from nodes.lab.importing.metric_options import MetricOptions
 from nodes.runtime.errors import ConfigError
 from tests.support import shut_world
+from tests.support.warehouse import EXAMPLES
 
 
 @pytest.mark.parametrize(
@@ -183,6 +185,17 @@ def test_a_world_with_an_experiment_file_is_driven_along_the_path_of_that_file()
     """Duckietown's first path by name turns left, and its experiment drives right."""
     assert AuditedWorld("duckietown").place(None).path == "right"
     assert AuditedWorld("duckietown").place("left").path == "left"
+
+
+def test_a_world_of_ones_own_is_named_from_where_the_user_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(EXAMPLES)
+    place = AuditedWorld("world_warehouse.py:Warehouse").place(None)
+    question = AuditedQuestion("grpc://127.0.0.1:1", "a driver", place, None)
+    file = AuditPlan.of(tmp_path / "audit", question).save()
+    assert load_experiment(file, "place", [], tmp_path / "audit" / "place").world.off_track_m == 0.6
+    assert (place.name, place.source) == ("world_warehouse.py:Warehouse", "world_warehouse.py:Warehouse")
 
 
 @pytest.mark.parametrize(
