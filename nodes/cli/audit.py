@@ -230,9 +230,17 @@ def _limit_m(options: PlaceOptions) -> float | None:
 
 
 def _refuse_unused(
-    place: PlaceOptions, metric: MetricOptions, search: SearchOptions, result: ResultOptions
+    place: PlaceOptions,
+    metric: MetricOptions,
+    search: SearchOptions,
+    result: ResultOptions,
+    overrides: list[str],
 ) -> None:
-    """Raise for options that would have no effect beside others."""
+    """Raise for options that would have no effect at all, or beside others."""
+    if gates := [each for each in overrides if re.match(r"\s*gate\s*[.=]", each)]:
+        raise ConfigError(
+            f"expected --set of what an audit uses, got --set {gates[0]}: it judges by a check of its own that has no settings; leave it out"
+        )
     if search.budget is not None and (search.evaluations is not None or result.ci):
         other = (
             "--evaluations"
@@ -321,7 +329,7 @@ def _audit(
 ) -> Audit:
     # What is wrong in the command is told before seconds of imports.
     wanted_m, minutes = _limit_m(place), _minutes(search.budget)
-    _refuse_unused(place, metric, search, result)
+    _refuse_unused(place, metric, search, result, overrides)
     if search.kind != "panel" and not Path(search.kind).is_file():
         raise ConfigError(
             f"--object: expected panel, or a .glb or .object.safetensors file, got {search.kind}, which is not there"

@@ -215,6 +215,8 @@ def test_a_world_of_ones_own_is_named_from_where_the_user_is(
             "--world lab --length a b 4 --marker 0.2",
             "expected one source of the scale, got --length and --marker",
         ),
+        ("--world lab --set gate=null", "got --set gate=null: it judges by a check of its own"),
+        ("--world lab --set gate.victims=0.3", "got --set gate.victims=0.3: it judges by"),
         ("--place . --length a b -4", "with a length above 0 m, got -4"),
         ("--place . --length a b nan", "expected finite numbers for --length"),
     ],
