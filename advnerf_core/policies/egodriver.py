@@ -26,12 +26,14 @@ from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.policies.adapter import AdaptedPolicy, adapt
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.policy_file import LoadedPolicy
-from advnerf_core.policies.tracker import TrackedTrajectory
+from advnerf_core.policies.tracker import TrackedTrajectory, pursued_points
 from advnerf_core.policies.view import PolicyView
 
 _ADDRESS = re.compile(r"(grpcs?)://(\[[0-9a-f:]+\]|[^:/\s]+):(\d{1,5})")
 _CAMERA, _US_PER_S = "camera_front", 1_000_000
 _LOOKAHEAD_S, _ANSWER_S = 0.5, 60.0
+# A plan leads backwards from this share of the lookahead behind the car on; one that stands still is nearer.
+_BACKWARDS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +114,17 @@ class EgoDriver:
         return f"{version.version_id} {version.git_hash}".strip()
 
     def initial_memory(self, batch: int) -> Tensor:
-        """Begin a session for each car, and end earlier ones."""
+        """Begin a session for each car, and end earlier ones.
+
+        Raises:
+            PolicyContractError: Another driver than at first answers, or none.
+        """
         from carla_driver_interface.protocol import DriveSessionCloseRequest
 
+        if (now := self._version()) != self.identity:
+            raise PolicyContractError(
+                f"expected the driver {self.identity} at {self.address}, got {now}: another one was started there; start the first one again"
+            )
         for session in self._sessions:
             self._ask("close_session", DriveSessionCloseRequest(session_uuid=session))
         self._sessions = [self._begin() for _ in range(batch)]
@@ -173,7 +183,24 @@ class EgoDriver:
         if not len(plan):
             return 0.0  # a driver without a plan holds its course
         ahead = rig.inverse().transform_points(plan.positions)[None, :, :2]
+        self._require_drivable(ahead, tick)
         return float(self.rig.tracker.control(ahead)[0])
+
+    def _require_drivable(self, ahead: Array, tick: int) -> None:
+        """Raise for a plan ``[1, N, 2]`` [m] that a car of constant speed cannot follow; the tracker makes a forward turn of one that leads backwards."""
+        where = f"from the driver {self.identity} at {self.address} in tick {tick}"
+        if not np.isfinite(ahead).all():
+            wrong = int(np.argmin(np.isfinite(ahead).all(axis=-1)))
+            raise PolicyContractError(
+                f"expected a plan of finite positions {where}, got NaN or infinity as pose {wrong + 1} of {ahead.shape[1]}; correct the driver"
+            )
+        lookahead_m = self.rig.tracker.lookahead_m
+        x_m, y_m = pursued_points(ahead, lookahead_m)[0].tolist()
+        if x_m < -_BACKWARDS * lookahead_m:
+            raise PolicyContractError(
+                f"expected a plan that leads ahead {where}, got one to {x_m:.2f} m ahead and {y_m:.2f} m to the left of the car, whose speed is constant; "
+                "plan in the car's frame, x forward"
+            )
 
     def _moved(self, pose: list[float], control: float) -> list[float]:
         """The car's pose a tick later: along an arc."""

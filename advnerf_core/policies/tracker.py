@@ -61,7 +61,14 @@ class TrackedTrajectory(StrictModel):
 
 
 def pursued_curvature_1pm(waypoints: Any, lookahead_m: float) -> Any:
-    """Curvature ``[B]`` [1/m], left positive, of the arcs from the car to the point at the lookahead distance.
+    """Curvature ``[B]`` [1/m], left positive, of the arcs from the car to the `pursued_points`."""
+    target = pursued_points(waypoints, lookahead_m)
+    distance_m2 = (target * target).sum(-1)
+    return 2.0 * target[:, 1] / (distance_m2 + (distance_m2 == 0.0))
+
+
+def pursued_points(waypoints: Any, lookahead_m: float) -> Any:
+    """Points ``[B, 2]`` [m] of the car's frame that the car is steered to.
 
     Args:
         waypoints: ``[B, N, 2]`` in metres in the car's frame (numpy or torch; differentiable).
@@ -81,9 +88,7 @@ def pursued_curvature_1pm(waypoints: Any, lookahead_m: float) -> Any:
     a = (step * step).sum(-1) + short
     b, c = (start * step).sum(-1), (start * start).sum(-1) - lookahead_m**2
     share = (1.0 - short) * ((b * b - a * c + short) ** 0.5 - b) / a + short
-    target = start + share[:, None] * step
-    distance_m2 = (target * target).sum(-1)
-    return 2.0 * target[:, 1] / (distance_m2 + (distance_m2 == 0.0))
+    return start + share[:, None] * step
 
 
 def _from_the_car(waypoints: Any) -> Any:

@@ -1,5 +1,6 @@
 """A driver behind a socket steers as its plan says, and is told what the car sees and where it is."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -113,6 +114,62 @@ def test_its_hash_names_its_answers() -> None:
         pytest.raises(PolicyContractError, match="it answers otherwise"),
     ):
         load_driver_at(other, VIEW, ACKERMANN, first.sha256)
+
+
+def test_another_driver_at_the_same_address_is_not_asked_on() -> None:
+    with serving(OnACircle(), port=0, host="127.0.0.1") as port:
+        policy = driver_at(f"grpc://127.0.0.1:{port}", VIEW, ACKERMANN)
+        Remembering(policy, 1)
+    other = OnACircle(radius_m=1.0)
+    other.name = "on_a_smaller_circle"
+    with (
+        serving(other, port=port, host="127.0.0.1"),
+        pytest.raises(PolicyContractError, match=rf"driver on_a_circle.*:{port}, got on_a_smaller_circle"),
+    ):
+        Remembering(policy, 1)
+    assert not other.pictures
+
+
+class AsTold(OnACircle):
+    """Plans the points that it is given, in the car's frame."""
+
+    def __init__(self, points: list[tuple[float, float]]) -> None:
+        super().__init__()
+        self.points = points
+
+    def drive(self, ctx: DriveContext) -> DriveResult:
+        plan = Trajectory.empty()
+        for number, (x, y) in enumerate(self.points, start=1):
+            plan.append(ctx.time_now_us + number * 100_000, Pose.from_xyz_yaw(x, y, 0.0, 0.0))
+        return DriveResult(trajectory_in_rig=plan)
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        ([(0.1, 0.0), (1.0, math.nan)], r"finite positions from the driver on_a_circle.*in tick 1, got NaN or infinity as pose 3 of 3"),
+        ([(math.inf, 0.0)], r"finite positions .*in tick 1"),
+        ([(-1.0, 0.2), (-2.0, 0.5)], r"leads ahead from the driver on_a_circle.*in tick 1, got one to -0\.39 m ahead"),
+        ([(-0.1, 0.0)], r"leads ahead .*in tick 1"),
+    ],
+)  # fmt: skip
+def test_a_plan_that_cannot_be_driven_is_refused(points: list[tuple[float, float]], message: str) -> None:
+    driver, image = AsTold([(1.0, 0.0)]), torch.zeros(1, 3, PINHOLE.height, PINHOLE.width)
+    with served(driver) as address:
+        drive = Remembering(driver_at(address, VIEW, ACKERMANN), 1)
+        assert drive(image).tolist() == [0.0]
+        driver.points = points
+        with pytest.raises(PolicyContractError, match=message):
+            drive(image)
+
+
+@pytest.mark.parametrize(
+    "points", [[(0.0, 0.0)], [(-0.001, 0.0), (-0.002, 0.0)], [(0.1, 0.3), (0.0, 0.6), (-0.3, 0.7)]]
+)
+def test_a_plan_to_stand_still_or_turn_hard_is_followed(points: list[tuple[float, float]]) -> None:
+    with served(AsTold(points)) as address:
+        drive = Remembering(driver_at(address, VIEW, ACKERMANN), 1)
+        assert np.isfinite(drive(torch.zeros(1, 3, PINHOLE.height, PINHOLE.width)).tolist()).all()
 
 
 @pytest.mark.parametrize(
