@@ -334,8 +334,6 @@ def _audit(
         raise ConfigError(
             f"--object: expected panel, or a .glb or .object.safetensors file, got {search.kind}, which is not there"
         )
-    from rich.console import Console
-
     from nodes.audit.asking import answer
     from nodes.audit.cars import car_of
     from nodes.audit.images import posed
@@ -343,6 +341,7 @@ def _audit(
     from nodes.audit.policies import resolve_policy
     from nodes.audit.question import CI_SECTIONS, AuditedQuestion
     from nodes.audit.run import CI_EVALUATIONS, Audit
+    from nodes.runtime.console import plain_console
 
     answers = Answers(wanted_m, place.speed_mps, place.camera_height_m, place.path)
     limit_m, declared, folder = answers.limit_m, place.declared or [], result.output
@@ -381,7 +380,7 @@ def _audit(
         question,
         folder,
         _say,
-        Console(),
+        plain_console(),
         minutes=minutes,
         evaluations=search.evaluations or (CI_EVALUATIONS if result.ci else None),
         against=result.against,

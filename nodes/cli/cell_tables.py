@@ -131,14 +131,13 @@ def _write_and_print(
     experiment: Experiment, full: ResultTable, folder: Path, clips_folder: Path, output: Path | None
 ) -> Path | None:
     """Table, targets and the predictions in ``folder`` to the terminal, and the page into ``output`` if it is asked for."""
-    from rich.console import Console
-
     from advnerf_core.files import write_json
     from advnerf_core.report.predictions import prediction_section, prediction_table, skill_text
     from advnerf_core.report.result_page import text_table
     from advnerf_core.report.targets import evaluate, target_table
     from nodes.experiment.pages.table import write_table
     from nodes.experiment.run.predictions import predicted
+    from nodes.runtime.console import plain_console
 
     pairs = predicted(folder, list(full.cells.values()))
     targets = evaluate(experiment.held_to.targets, full)
@@ -148,7 +147,7 @@ def _write_and_print(
         page = write_table(full, clips_folder, output, sections, targets=targets)
         if pairs:
             write_json(output / "predictions.json", [asdict(pair) for pair in pairs])
-    console = Console(width=None if sys.stdout.isatty() else 200)
+    console = plain_console(width=None if sys.stdout.isatty() else 200)
     console.print(text_table(full).rich())
     if targets:
         console.print(target_table(targets).rich())

@@ -10,6 +10,8 @@ from typing import NamedTuple, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from nodes.runtime.console import plain_console
+
 LOG_PERIOD_S = 15.0
 
 
@@ -72,7 +74,7 @@ class ProgressDisplay:
     """
 
     def __init__(self, console: Console | None = None, watcher: StageDisplay | None = None) -> None:
-        self._console, self._watcher = console or Console(), watcher
+        self._console, self._watcher = console or plain_console(), watcher
         columns = (
             TextColumn("{task.fields[stage]:<8}", markup=False),
             BarColumn(bar_width=24),

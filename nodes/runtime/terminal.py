@@ -154,10 +154,10 @@ def coloured(text: str, colour: str) -> Text:
 
 
 def print_table(full: Table) -> None:
-    """Print a table as it is: nothing in brackets, such as a unit, is markup. In a pipe, its lines are not wrapped."""
-    from rich.console import Console
+    """Print a table as it is, see `plain_console`. In a pipe, its lines are not wrapped."""
+    from nodes.runtime.console import plain_console
 
-    Console(width=None if sys.stdout.isatty() else 240, markup=False).print(full)
+    plain_console(width=None if sys.stdout.isatty() else 240).print(full)
 
 
 def fail_unless(met: bool) -> None:

@@ -39,6 +39,7 @@ from nodes.experiment.show.spaces import make_space
 from nodes.experiment.steps import films
 from nodes.experiment.steps.attack import dress_cell, load_shown, planned_evaluations
 from nodes.experiment.steps.keys import driven_folder
+from nodes.runtime.console import plain_console
 from nodes.runtime.progress import Report
 
 PAGE = "report.html"
@@ -118,7 +119,7 @@ def _then(experiment: Experiment) -> str:
 
 def print_summary(experiment: Experiment, console: Console) -> None:
     """Print the table, its targets, and the path of the page."""
-    wide = Console(
+    wide = plain_console(
         file=console.file, width=max(console.width, _TABLE_WIDTH), force_terminal=console.is_terminal
     )
     table, folder = table_of(experiment), experiment.stage_folder("report")

@@ -28,6 +28,7 @@ from nodes.experiment.steps.keys import require_searchable
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import make_ready
 from nodes.experiment.steps.steering_gate import require_same_steering
+from nodes.runtime.console import plain_console
 from nodes.runtime.progress import ProgressDisplay
 
 REPORT = "report"
@@ -55,7 +56,7 @@ def run_experiment(
         StageError: ``until`` names no stage.
         ConfigError: The folder has the stages of another experiment, or ``only`` matches no cell.
     """
-    console, began = console or Console(), time.monotonic()
+    console, began = console or plain_console(), time.monotonic()
     require_own_folder(experiment)
     look_at_given(experiment)
     stages = [*stages_of(experiment), _report_stage(experiment, {})]

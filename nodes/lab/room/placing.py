@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.live import Live
 
 from advnerf_core.attack.artifact import AttackFile
@@ -17,6 +16,7 @@ from advnerf_core.geometry import Array
 from calibration.placement import Misplacement, measured_pose, misplacement
 from calibration.schema import TargetCalibration
 from nodes.lab.room.live import standing_poses
+from nodes.runtime.console import plain_console
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.terminal import table
 
@@ -42,7 +42,7 @@ def guide(
         The last displacement and the subject's pose ``[4, 4]``; None if the subject was never seen.
     """
     found, deadline = None, time.monotonic() + timeout_s
-    with Live(console=Console(stderr=True, markup=False), refresh_per_second=4, transient=True) as live:
+    with Live(console=plain_console(stderr=True), refresh_per_second=4, transient=True) as live:
         for T in standing_poses(run_dir, f"/vicon/{target.subject}", 0.5):
             if T is None:
                 live.update(f"{target.subject} is lost")

@@ -64,6 +64,21 @@ def test_tables_show_what_is_in_brackets(capsys):
     assert capsys.readouterr().out.split() == ["x", "[m]", "state", "of", "[/room]", "[met]"]
 
 
+def test_the_name_of_a_class_is_no_emoji(capsys):
+    rows = table("error")
+    rows.add_row("my.py:Robot: failed")
+    print_table(rows)
+    with ProgressDisplay() as display:
+        display.start("my.py:Robot: failed")
+    assert capsys.readouterr().out.count("my.py:Robot: failed") == 2
+
+
+def test_every_console_prints_texts_as_they_are():
+    nodes = Path(terminal.__file__).parents[1]
+    made = {file.name for file in nodes.rglob("*.py") if re.search(r"\bConsole\((?!quiet)", file.read_text())}
+    assert made == {"console.py"}
+
+
 def test_no_command_escapes_what_tables_print_as_it_is():
     """`print_table` reads no markup, so that an escape would be shown. Help alone is escaped, in one place."""
     nodes = Path(terminal.__file__).parents[1]
