@@ -16,7 +16,7 @@ import traceback
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal, NoReturn, TextIO
 
 from advnerf_core.files import write_atomically
 from advnerf_core.plugins import exit_refused, in_one_line
@@ -26,6 +26,7 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench, run_cell, search_cell
 from nodes.experiment.run.store import LOG, Store
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import VictimUnknownError
 from nodes.experiment.steps.keys import cell_settings, settings_hash, stages_needed
 from nodes.experiment.steps.run import load_experiment
 from nodes.lab.trials.trial_runner import LIVE_LOCK
@@ -36,7 +37,7 @@ from nodes.runtime.progress import Report
 from nodes.runtime.termination import ends_in_order, wait_or_kill
 
 Phase = Literal["search", "whole"]
-_DONE, _FAILED, _ELSEWHERE, _ASKED_TO_END = 0, 1, 3, 128 + signal.SIGTERM
+_DONE, _FAILED, _ELSEWHERE, _CHANGED, _ASKED_TO_END = 0, 1, 3, 4, 128 + signal.SIGTERM
 _PROGRESS_PERIOD_S = 5.0
 _LOOKED_AT_S = 1.0
 # Longer than CarlaScene waits for a server that is gone.
@@ -46,6 +47,10 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 class ChangedError(RuntimeFault):
     """An input of a cell changed between the plan and the run."""
+
+
+# No fault of the cell, whose next run may find its inputs as they were: kept as an error it would not be run again.
+_OF_INPUTS = (ChangedError, VictimUnknownError)
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,8 @@ class Ended:
     """How the process of a cell ended.
 
     Attributes:
-        how: ``done``, ``failed`` (the error is stored), ``elsewhere`` (another process runs it), or ``lost`` (killed: the next run resumes it).
+        how: ``done``, ``failed`` (the error is stored), ``elsewhere`` (another process runs it), or ``lost`` (killed, or its inputs
+            changed: the next run resumes it).
         seconds: Wall time [s].
     """
 
@@ -131,6 +137,8 @@ def run_in_process(job: Job) -> Ended:
         return Ended(job.name, "done", _not_driven(job, store), seconds)
     if code == _ELSEWHERE:
         return Ended(job.name, "elsewhere", said, seconds)
+    if code == _CHANGED:
+        return Ended(job.name, "lost", said, seconds)
     # A process that was asked to end closed its resources, and reports it by the shell's exit code.
     if code < 0 or code == _ASKED_TO_END:
         by = signal.Signals(-code) if code < 0 else signal.SIGTERM
@@ -158,6 +166,8 @@ def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, repor
         try:
             with exit_refused():
                 _run(job, store, work, experiment, report, bench)
+        except _OF_INPUTS as error:
+            return Ended(job.name, "lost", in_one_line(error), time.monotonic() - began)
         except Exception as error:
             text = in_one_line(error)
             store.keep_error(job.name, job.settings_hash, text)
@@ -197,6 +207,8 @@ def _run_job() -> None:
             try:
                 with exit_refused():
                     _run(job, store, work, experiment, _log_progress())
+            except _OF_INPUTS as error:
+                _end_changed(error)
             except Exception as error:
                 traceback.print_exc(file=log)
                 store.keep_error(job.name, job.settings_hash, in_one_line(error))
@@ -226,10 +238,17 @@ def _checked(job: Job, store: Store) -> Experiment:
             raise ChangedError(
                 f"{job.name}: its settings or inputs changed after the experiment was started; run it again"
             )
+    except _OF_INPUTS as error:
+        _end_changed(error)
     except Exception as error:
         store.keep_error(job.name, job.settings_hash, in_one_line(error))
         raise SystemExit(_FAILED) from None
     return experiment
+
+
+def _end_changed(error: Exception) -> NoReturn:
+    print(in_one_line(error), file=sys.stderr)
+    raise SystemExit(_CHANGED) from None
 
 
 def _run(

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from advnerf_core.documents import read_json
 from advnerf_core.policies.contract import PolicyContract
-from advnerf_core.policies.load import source_sha256
+from advnerf_core.policies.load import is_factory, source_sha256
 from advnerf_core.policies.policy_file import policy_sha256
 from advnerf_core.strict import StrictModel
 from nodes.experiment.engine.run_folder import RunFolder
@@ -67,9 +67,12 @@ def given_victim(experiment: RunFolder, victim: str) -> GivenPolicy:
     """
     spec, kept = given_in(experiment.config)[victim], read_kept(experiment.folder).get(victim)
     if kept is None or (kept.policy, kept.source_sha256) != (spec, source_sha256(spec)):
+        other = "another"
+        if is_factory(spec):
+            other += " (all Python files of its package, or else of its folder, count, also added and removed ones)"
         raise VictimUnknownError(
             f"{experiment.file}: victims.{victim}: expected {spec} as it was when the experiment was last run, got "
-            f"{'one that was never looked at' if kept is None else 'another'}; run the experiment"
+            f"{'one that was never looked at' if kept is None else other}; run the experiment"
         )
     return kept
 

@@ -24,10 +24,11 @@ from advnerf_core.policies.tracker import TrackedTrajectory
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.plan import statuses
+from nodes.experiment.run.plan import plan_cells, statuses
 from nodes.experiment.run.registering import register
 from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.run.whole import run_experiment
+from nodes.experiment.run.worker import run_in_process
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import victim_sha256
 from nodes.experiment.show.victims import look_at_given
@@ -282,6 +283,24 @@ def test_another_policy_under_the_same_name_is_another_cell(folder: Path, tmp_pa
     finally:
         (folder / "my_driver.py").write_text(text)
     assert states["module"] == "changed"
+
+
+def test_a_module_that_is_there_for_a_moment_fails_no_cell(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "run", tmp_path / "run")
+    changes = (*ONLY_THE_MODULE, "over.seed=[0,1]")
+    experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", changes, tmp_path / "run")
+    look_at_given(experiment)
+    cell = Cell("track", "module", "random", 1)
+    (job,) = plan_cells(experiment, [cell])
+    (folder / "beside.py").write_text("")
+    try:
+        ended = run_in_process(job)
+    finally:
+        (folder / "beside.py").unlink()
+    assert (ended.how, "my_driver:factory as it was" in ended.text) == ("lost", True), ended.text
+    assert "all Python files of its package, or else of its folder, count" in ended.text
+    assert [each.state for each in statuses(experiment, [cell])] == ["missing"]
+    assert run_in_process(job).how == "done"
 
 
 @pytest.mark.parametrize(
