@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import math
 import os
 import re
 from collections.abc import Iterable
@@ -94,6 +95,11 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 def write_json(path: Path, data: Any) -> None:
     """Write an indented JSON value, whole or not at all."""
     write_atomically(path, json.dumps(data, indent=1) + "\n")
+
+
+def finite_or_none(value: float) -> float | None:
+    """A number as JSON can hold it: None, which is its null, for infinity or NaN."""
+    return value if math.isfinite(value) else None
 
 
 def not_writable(path: str | os.PathLike[str], error: OSError) -> str:

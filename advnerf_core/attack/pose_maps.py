@@ -125,7 +125,7 @@ def landscape(
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     found = sensor.placements(theta)
 
-    def total(index: int) -> list[float]:
+    def total(index: int) -> list[float | None]:
         placements = found.clone()
         placements[number, :3] = torch.from_numpy(points[index])
         return _drive(problem, theta, placements)[0]
@@ -134,7 +134,11 @@ def landscape(
     cells = _cells(len(points), total, file, _fingerprint(problem, theta, settings_hash, names), on_cell)
     shape = (len(axes[0]), len(axes[1]), len(axes[2]))
     return Landscape(
-        number, axes[0], axes[1], axes[2], np.array([np.mean(cell) for cell in cells]).reshape(shape)
+        number,
+        axes[0],
+        axes[1],
+        axes[2],
+        np.array([np.mean(cell) for cell in np.array(cells, float)]).reshape(shape),
     )
 
 
@@ -175,7 +179,7 @@ def robustness_map(
     plain = sensor.surrogate.plain_theta(torch.float64)
     found = sensor.placements(theta)
 
-    def row(index: int) -> list[list[float]]:
+    def row(index: int) -> list[list[float | None]]:
         placements = found.clone()
         placements[number, :3] += torch.from_numpy(shifts[index])
         return [*_drive(wide, theta, placements), _drive(wide, theta, placements, plain)[0]]
@@ -189,11 +193,11 @@ def robustness_map(
 
 def _drive(
     problem: AttackProblem, theta: Tensor, placements: Tensor, colours: Tensor | None = None
-) -> tuple[list[float], list[float]]:
-    """Total CTE and largest |CTE| of each start with objects at ``placements``; NaN if one of them is on the lane."""
+) -> tuple[list[float | None], list[float | None]]:
+    """Total CTE and largest |CTE| of each start with objects at ``placements``; None, which JSON can hold, if one of them is on the lane."""
     sensor = placed_sensor(problem)
     if not sensor.space.clear(placements):
-        nothing = [float("nan")] * len(problem.start_states)
+        nothing: list[float | None] = [None] * len(problem.start_states)
         return nothing, nothing
     surrogate = sensor.surrogate.with_objects(placed(sensor.space.objects, placements))
     shown = (sensor.colours(theta) if colours is None else colours).to(surrogate.dtype)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.files import finite_or_none
 from advnerf_core.learning.augment import AugmentConfig
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet, FrameStoreError
@@ -131,8 +132,8 @@ def fine_tune(
     metadata = {
         "fine_tuned_from": policy.sha256,
         "settings": json.loads(json.dumps(asdict(config))),
-        "old_mae_rad": _finite(after[0]),
-        "new_mae_rad": _finite(after[1]),
+        "old_mae_rad": finite_or_none(after[0]),
+        "new_mae_rad": finite_or_none(after[1]),
         "old_frames": sum(map(len, old)),
         "new_frames": sum(map(len, new)),
     }
@@ -150,8 +151,3 @@ def _errors(network: SteeringNetwork, frames: MixedFrames) -> tuple[float, float
         errors.append(mean_absolute_error(network, frames) if len(rows) else float("nan"))
         frames.held_out = kept
     return errors[0], errors[1]
-
-
-def _finite(value: float) -> float | None:
-    """A number as JSON can hold it: None for infinity or NaN."""
-    return value if np.isfinite(value) else None

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.documents import read_json
-from advnerf_core.files import write_json
+from advnerf_core.files import finite_or_none, write_json
 from advnerf_core.geometry import Array, planar_poses
 from advnerf_core.scene.bake import NotBakedError
 from advnerf_core.scene.baked import BakedScene
@@ -54,7 +54,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     write_json(folder / COMPARED, {"used": used, **found, "mib": baked.voxels.nbytes / 2**20})
 
 
-def _beside_views(experiment: Experiment, baked: BakedScene) -> tuple[bool, dict[str, float]]:
+def _beside_views(experiment: Experiment, baked: BakedScene) -> tuple[bool, dict[str, float | None]]:
     """Whether a baked scene is used, and by what: the loss by baking on held-out views."""
     fidelity = read_json(experiment.stage_folder("scene") / FIDELITY)
     before_db, after_db = fidelity["mean"]["psnr_policy_db"], _held_out_psnr_db(experiment, baked)
@@ -63,7 +63,7 @@ def _beside_views(experiment: Experiment, baked: BakedScene) -> tuple[bool, dict
     return before_db - after_db <= most_lost_db, found
 
 
-def _beside_itself(experiment: Experiment, baked: BakedScene) -> tuple[bool, dict[str, float]]:
+def _beside_itself(experiment: Experiment, baked: BakedScene) -> tuple[bool, dict[str, float | None]]:
     """The same for a scene of the user's own, of which there are no held-out views: it is compared itself."""
     scene, pinhole = load_field(experiment), experiment.view.pinhole
     found_db = [
@@ -71,7 +71,10 @@ def _beside_itself(experiment: Experiment, baked: BakedScene) -> tuple[bool, dic
         for pose in views_of(experiment)[:: _VIEWS // _COMPARED_VIEWS]
     ]
     mean_db = float(np.mean(found_db))
-    return mean_db >= _LEAST_ALIKE_DB, {"psnr_to_scene_db": mean_db, "least_db": _LEAST_ALIKE_DB}
+    return mean_db >= _LEAST_ALIKE_DB, {
+        "psnr_to_scene_db": finite_or_none(mean_db),
+        "least_db": _LEAST_ALIKE_DB,
+    }
 
 
 def views_of(experiment: Experiment) -> Array:

@@ -67,6 +67,22 @@ def test_a_robustness_map_compares_with_plain_colours_at_the_same_poses(problem,
     assert cv2.imdecode(np.frombuffer(top, np.uint8), 1).std() > 10
 
 
+def test_files_of_maps_are_json_where_an_object_is_on_the_lane(problem, theta, tmp_path):
+    files = tmp_path / "landscape.json", tmp_path / "robustness.json"
+    made = [
+        landscape(problem, theta, GRID, file=files[0]),
+        robustness_map(
+            problem, theta, [(-1.1, -1.75, 0.05)], [(0.0, 0.0, 0.0), (-2.5, 0.0, 0.0)], 0, files[1]
+        ),
+    ]
+    for file, found in zip(files, made, strict=True):
+        assert np.isnan(found.total_cte_m).any()
+        assert "null" in file.read_text()
+        json.loads(file.read_text(), parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))
+    again = landscape(problem, theta, GRID, file=files[0])
+    np.testing.assert_array_equal(again.total_cte_m, made[0].total_cte_m)
+
+
 @pytest.mark.parametrize("kind", ["landscape", "robustness"])
 def test_a_stopped_map_goes_on_to_the_bit_and_finished_cells_are_not_driven_again(
     problem, theta, tmp_path, kind

@@ -1,5 +1,7 @@
 """A learned scene of the user's own is searched through its voxels if these look like it, and attacks are judged in the scene itself."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -48,6 +50,15 @@ def test_the_search_uses_voxels_and_the_attack_is_judged_in_the_field(tmp_path, 
     (file,) = run_attack(experiment, experiment.folder, ProgressDisplay())
     attack = load_attack(file)
     assert attack.field_total_cte_m == pytest.approx(attack.predicted_total_cte_m, rel=0.05)
+
+
+def test_voxels_that_look_the_same_are_told_in_json(tmp_path, monkeypatch):
+    monkeypatch.setattr(bake, "psnr", lambda *_: float("inf"))  # as of a scene without anything in sight
+    experiment = loaded(walls_of_fog(tmp_path, contraction=False))
+    prepare(experiment)
+    text = (experiment.folder / "bake" / "baked.json").read_text()
+    found = json.loads(text, parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))
+    assert (found["used"], found["psnr_to_scene_db"]) == (True, None)
 
 
 def test_voxels_that_look_different_are_left_aside(tmp_path, monkeypatch):
