@@ -313,7 +313,7 @@ class AuditBudget(StrictModel):
         default=None, description="For the whole audit, as the user gave it; converted into evaluations once."
     )
     seconds: NotNegative | None = Field(
-        description="Time that the audit took [s]; null where the same audit is to give the same bytes."
+        description="Time that the command took which ended the audit [s], without earlier ones that it went on from; null where the same audit is to give the same bytes."
     )
     ended: Literal["schedule", "budget", "interrupted"]
 

@@ -235,7 +235,7 @@ def _facts(result: AuditResult) -> list[tuple[str, str]]:
         ("Policy", f"{result.policy.path}, sha256 {(result.policy.sha256 or 'unknown')[:12]}"),
         ("Place", result.place.source),
         ("Lane", f"out of it beyond {result.place.off_track_m:g} m" if result.place.off_track_m else "unknown"),
-        ("Budget", f"{budget.evaluations_spent} of {budget.evaluations_planned} evaluations{'' if budget.seconds is None else f', {budget.seconds:.0f} s in all'}"),
+        ("Budget", f"{budget.evaluations_spent} of {budget.evaluations_planned} evaluations{'' if budget.seconds is None else f', {budget.seconds:.0f} s in this run'}"),
         ("Starts", f"searched from seeds {result.starts.search.seed} and above, chosen from {result.starts.selection.count} starts of seed "
                    f"{result.starts.selection.seed}, judged from {result.starts.judging.count} of seed {result.starts.judging.seed}"),
         ("Experiment", f"{result.question.file}, sha256 {result.question.sha256[:12]}"),
