@@ -16,7 +16,7 @@ from advnerf_core.files import write_atomically
 
 def in_one_line(attack: AttackFile) -> str:
     """The attack's total, and the policy's without it."""
-    total = "unknown" if attack.predicted_total_cte_m is None else f"{attack.predicted_total_cte_m:.1f} m"
+    total = "unknown" if attack.predicted_total_cte_m is None else f"{attack.predicted_total_cte_m:.2f} m"
     clean = "without attack not driven" if attack.clean_drive is None else attack.clean_drive.short
     return f"attack {attack.attack_id}, {attack.method}, predicted total CTE {total}, {clean}"
 
