@@ -195,7 +195,7 @@ def require_searchable(experiment: Experiment, cells: Sequence[Cell]) -> None:
         inside = experiment.of(cell)
         try:
             _require_objective(inside)
-            if cell.method != NONE and cell.code not in METHODS:
+            if cell.searched and cell.code not in METHODS:
                 load_method(cell.code)
         except PluginError as error:
             raise NoSuchCellError(f"{experiment.file}: {error}") from None

@@ -7,7 +7,7 @@ from advnerf_core.plugins import name_in_results
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import runs_alone
 from nodes.experiment.steps.attack import search_settings
-from nodes.experiment.steps.keys import cell_settings, clean_folder
+from nodes.experiment.steps.keys import cell_settings, clean_folder, require_searchable
 from nodes.experiment.steps.run import load_experiment
 from tests.support.strangers import write_spiral
 
@@ -57,6 +57,12 @@ def test_all_methods_may_evaluate_equally_often_and_those_without_a_gradient_sea
     assert {(each.learning_rate, each.sigma, each.population, each.cells) for each in settings.values()} == {
         (None, None, 10, 4)
     }
+
+
+def test_the_control_without_objects_is_no_unknown_method(tmp_path):
+    experiment = room(tmp_path, "over.method=[none,empty,random]", file="junction")
+    assert "empty" in [cell.method for cell in experiment.cells]
+    require_searchable(experiment, experiment.cells)
 
 
 def test_a_method_that_a_user_brings_names_its_cells(tmp_path):
