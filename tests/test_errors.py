@@ -15,7 +15,7 @@ from nodes.runtime.process import _one_line
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 # Caught where they are raised; no user sees them.
-INTERNAL = {"NodeFinished", "_Stopped", "Damaged", "NotMet"}
+INTERNAL = {"NodeFinished", "_Stopped", "Damaged", "NotMet", "MetButLook"}
 
 
 def exception_classes():
