@@ -56,7 +56,7 @@ def _locked(temporary: Path) -> BufferedRandom:
 
 
 def refuse_overwriting(inputs: Iterable[Path | None], outputs: Iterable[Path]) -> None:
-    """Refuse outputs that would replace an input, under whatever name, a file in an input folder, a folder, or another output.
+    """Refuse outputs that would replace an input, under any name, a file in an input folder, a folder, or another output.
 
     Args:
         inputs: Files and folders that the user gave; None for an option that was not given.
@@ -83,7 +83,7 @@ def refuse_overwriting(inputs: Iterable[Path | None], outputs: Iterable[Path]) -
 
 
 def is_plain_name(name: str) -> bool:
-    """Whether a name is that of a file alone, on any system, so that a stranger's file cannot have others written elsewhere."""
+    """Whether a name is one of a file alone, on any system, so that a stranger's file cannot have others written elsewhere."""
     return name not in ("", ".", "..") and not any(each in name for each in "/\\\0")
 
 
@@ -139,7 +139,7 @@ def read_tensors(
 
     Raises:
         OSError: The file cannot be opened.
-        ValueError: It is damaged, has no tensor of a name, or one of a type that the framework lacks.
+        ValueError: The file is damaged, has no tensor of a name, or one of a type that the framework lacks.
         PlaceError: The path is not UTF-8, which the library would take for a damaged file.
     """
     from safetensors import SafetensorError, safe_open

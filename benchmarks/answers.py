@@ -197,7 +197,7 @@ def _better(sets: Sequence[Mapping[str, Any]]) -> str:
         f"Than random textures: deployed, the gradient adds {min(added):.2f} to {max(added):.2f} m per tick, with p < 0.05 in {shown} of {len(tests)} "
         f"comparisons. {single} ran one random family; the others take the strongest in the learned scene."
         + (
-            f" In {unshown} the gradient is not shown to be better in the learned scene, where it searches."
+            f" In {unshown} it is not shown to be better in the learned scene, where it searches."
             if unshown
             else ""
         )

@@ -32,7 +32,7 @@ LEDGER = REPOSITORY / "docs" / "results.json"
 PAGE = REPOSITORY / "docs" / "results.md"
 _PICTURE = """![All deployed drives in Duckietown's simulator from above, and what the camera saw](results/gap_duckietown_robust_above.webp)
 
-*All deployed drives of one registered set, in Duckietown's simulator. [Each set](results/transfer.md) has this picture. No real car
+*One registered set, in Duckietown's simulator. [Each set](results/transfer.md) has this picture. No real car
 was driven: [what was and was not run](was_not_run.md).*
 
 """
@@ -163,7 +163,7 @@ def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answ
         "rows of kept drives again; the others were measured once.\n\n## In short\n\n"
         + table(found)
         + (sets and f"\n{sets}")
-        + "\n## All rows\n\nA row that misses its target stays, with the reason: [missed targets](results/missed.md).\n\n"
+        + "\n## All rows\n\nA row that misses its target stays: [missed targets](results/missed.md).\n\n"
         "| question | rows | with a target | missed |\n|---|---|---|---|\n"
     )
     lines = [

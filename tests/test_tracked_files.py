@@ -12,9 +12,9 @@ ROOT = Path(__file__).parents[1]
 # 28 MB for its 147 cells; metadrive_billboard, metadrive_run_wide and victims of Duckietown 14 MB, less 9 MB of explorations;
 # paper_junction_sides: 12 MB, half of it the textures of five objects in each of 12 attacks; paper_monitor: 5 MB, without its scene and victim;
 # retrain: 3 MB, its two policies; paper_spaces: 26 MB, three quarters of it the meshes and places of its 66 attacks.
-# metadrive_victims: 9 MB, 112 cells and two more victims. victim_panel: 12 MB, 49 cells and five more victims. paper_car_sides and
-# paper_car_long: 5 MB each, 37 cells.
-MOST_TRACKED_BYTES = 210_000_000
+# metadrive_victims: 9 MB, 112 cells and two more victims. victim_panel: 12 MB, 49 cells and five more victims. paper_car_sides,
+# paper_car_long and paper_monitor_wall: 5 MB each, 37 cells.
+MOST_TRACKED_BYTES = 215_000_000
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,18 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.page import searched_apart
 from benchmarks.paper_table import PUBLISHED, ledger_rows
 
-CAR, CAR_SIDES, CAR_LONG, MONITOR, JUNCTION, SIDES, SPACES = (
+CAR, CAR_SIDES, CAR_LONG, MONITOR, WALL, JUNCTION, SIDES, SPACES = (
     PUBLISHED / f"paper_{name}"
-    for name in ("car", "car_sides", "car_long", "monitor", "junction", "junction_sides", "spaces")
+    for name in (
+        "car",
+        "car_sides",
+        "car_long",
+        "monitor",
+        "monitor_wall",
+        "junction",
+        "junction_sides",
+        "spaces",
+    )
 )
 
 
@@ -24,6 +33,7 @@ CAR, CAR_SIDES, CAR_LONG, MONITOR, JUNCTION, SIDES, SPACES = (
         (CAR_SIDES, "green_screen", ", one side of the path maximised", False),
         (CAR_LONG, "green_screen", ", one side of the path maximised, searched longer", True),
         (MONITOR, "monitor", ", behind the way of a car that leaves the track", True),
+        (WALL, "monitor", ", on the wall", True),
     ],
 )
 def test_drives_off_the_track_are_those_of_the_cells(published, scenario, changed, met):
@@ -52,14 +62,14 @@ def test_drives_off_the_track_are_those_of_the_cells(published, scenario, change
     least = {"green_screen": 0.8, "monitor": 0.6}[scenario]
     assert unharmed.value == round(100.0 * sum(free) / len(free))
     assert unharmed.met is (sum(free) >= least * len(free))
-    assert unharmed.met is (published == CAR_LONG)
+    assert unharmed.met is (published in (CAR_LONG, WALL))
 
 
 def test_the_tests_are_those_of_complete_sets(tmp_path):
     row = ledger_rows(PUBLISHED)[0]
     tests = [
         each
-        for name in (CAR, CAR_SIDES, CAR_LONG, MONITOR, JUNCTION, SIDES, SPACES)
+        for name in (CAR, CAR_SIDES, CAR_LONG, MONITOR, WALL, JUNCTION, SIDES, SPACES)
         for each in json.loads((name / "set" / "set.json").read_text())["primary"]
     ]
     assert (row.value, row.unit, row.met) == (len(tests), f"of {len(tests)}", True)
