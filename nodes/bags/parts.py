@@ -63,13 +63,18 @@ def bag_parts(bag: Path) -> tuple[Path, ...]:
     return _by_number(bag, files)
 
 
-def unread_files(bag: Path) -> tuple[str, ...]:
-    """Names of the bag files in a bag's folder that are not its parts, as of another recording that was copied there."""
+def unread_files(bag: Path) -> str:
+    """Which bag files in a bag's folder are not its parts, as of another recording that was copied there; empty if there are none."""
     if not Path(bag).is_dir():
-        return ()
+        return ""
     parts = bag_parts(bag)
     files = [file for suffix in SUFFIXES for file in _of_suffix(Path(bag), suffix)]
-    return tuple(file.name for file in files if file not in parts)
+    unread = [file.name for file in files if file not in parts]
+    return (
+        f"not read, as no part of this bag: {', '.join(unread)}; give each of these files by itself"
+        if unread
+        else ""
+    )
 
 
 def _parts_with(file: Path) -> tuple[Path, ...]:

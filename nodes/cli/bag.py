@@ -64,7 +64,7 @@ def bag_info(
     for step in read_steps_back(bag):
         print(f"{step}: {SET_BACK}")
     if unread := unread_files(bag):
-        print(f"not read, as no part of this bag: {', '.join(unread)}; give each of these files by itself")
+        print(unread)
     for key, value in info.metadata.items():
         print(f"{key}: {value}")
     print(f"attachments: {', '.join(info.attachments) or 'none'}")

@@ -72,8 +72,8 @@ def _print_facts(name: str, facts: LogFacts) -> None:
     rows.add_row("poses", str(log.poses) if log.poses else "none")
     if left_out := ", ".join(f"{count} {why}" for why, count in log.left_out.items()):
         rows.add_row("left out", left_out)
-    if log.joined_by:
-        rows.add_row("joined by", log.joined_by)
+    for note in log.notes:
+        rows.add_row("note", note)
     if log.unchecked:
         rows.add_row("unchecked", log.unchecked)
     for verdict in facts.verdicts():

@@ -172,8 +172,7 @@ def train(
     for each in opened:
         if not each.log.rate_hz:
             print(f"{each.name}: {each.log.rate_in_words}; frames are held out in the order of the log")
-        if each.log.joined_by:
-            print(f"{each.name}: images and steering are joined by {each.log.joined_by}")
+        print("".join(f"{each.name}: {note}\n" for note in each.log.notes), end="")
     print(
         f"{done.path} {done.sha256[:12]}, {1e3 * done.validation_mae_rad:.1f} mrad from the labels on held-out frames"
         + "".join(f"; {name} unchecked: {reason}" for name, reason in done.unchecked.items())
@@ -251,7 +250,8 @@ def evaluate(
         files = measure.write_saliency(loaded.policy, found, folder, count, video, goals)
         written.append(f"{folder / 'steering.png'}, {len(files)} saliency files in {folder}")
     print_table(rows)
-    print("\n".join([*crop_notes(opened, loaded.view), *written]))
+    notes = [f"{each.name}: {note}" for each in opened for note in each.log.notes]
+    print("\n".join([*notes, *crop_notes(opened, loaded.view), *written]))
 
 
 def _folders(output: Path | None, logs: list[OpenLog]) -> list[Path]:

@@ -132,7 +132,7 @@ class DriveLog:
         left_out: Number of records that the log itself marks as unusable, by reason.
         attached: Reads attached files by name, such as ``camera.yaml``.
         unchecked: Why damage may go unnoticed; empty if checksums cover the log.
-        joined_by: What images and steering were joined by, if not by capture stamps, and why.
+        notes: What its user should know, such as files beside it that are not read.
         without_controls: What a log of this format has and needs, if there are no controls.
     """
 
@@ -152,7 +152,7 @@ class DriveLog:
     left_out: Mapping[str, int] = field(default_factory=dict)
     attached: Callable[[], Mapping[str, bytes]] = dict
     unchecked: str = ""
-    joined_by: str = ""
+    notes: tuple[str, ...] = ()
     without_controls: str = "the log has no numbers"
 
     @property

@@ -33,6 +33,7 @@ from advnerf_core.data.logs.drive_log import (
 from advnerf_core.geometry import yaw_of
 from nodes.bags.images import CAMERA_TOPICS
 from nodes.bags.info import BagInfo, BagMessage
+from nodes.bags.parts import unread_files
 from nodes.bags.reader import read_attachments, read_info, read_messages
 from nodes.bags.time_gaps import LONGEST_SILENCE_S, find_gaps
 from nodes.control.pose_buffer import PoseBuffer
@@ -144,9 +145,7 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
         labels="expert" if counts.get(CAR_TOPIC) else "recorded",
         attached=lambda: read_attachments(bag) if info.attachments else {},
         unchecked=info.unchecked,
-        joined_by=f"times of recording, as all stamps on {' and '.join(unstamped)} are equal"
-        if unstamped
-        else "",
+        notes=_notes(bag, unstamped),
         without_controls=without_controls,
     )
 
@@ -175,6 +174,17 @@ def _steering_topic(wanted: str | None, controls: tuple[str, ...], bag: Path) ->
     if wanted is not None or _SENT in controls or len(controls) == 1:
         return chosen_name(wanted, controls, "a topic with wheel angles", bag)
     return None
+
+
+def _notes(bag: Path, unstamped: list[str]) -> tuple[str, ...]:
+    found = []
+    if unstamped:
+        found.append(
+            f"images and steering are joined by times of recording, as all stamps on {' and '.join(unstamped)} are equal"
+        )
+    if unread := unread_files(bag):
+        found.append(unread)
+    return tuple(found)
 
 
 def _without_controls(types: Mapping[str, str]) -> str:

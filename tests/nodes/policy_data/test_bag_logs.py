@@ -1,6 +1,7 @@
 """Bags as logs: ours exported and read again, and those of other software with Ackermann commands."""
 
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -203,9 +204,21 @@ def test_ackermann_commands_of_other_software_are_wheel_angles(tmp_path, form):
 def test_what_has_no_stamps_is_joined_by_the_times_of_recording(tmp_path, unstamped):
     """A zero stamp of every command would give all images one command, the smallest."""
     log = open_log(write_ackermann(tmp_path / "drive", "ros2", unstamped=unstamped))
-    assert log.joined_by == f"times of recording, as all stamps on {' and '.join(unstamped)} are equal"
+    assert log.notes == (
+        f"images and steering are joined by times of recording, as all stamps on {' and '.join(unstamped)} are equal",
+    )
     assert [frame.steering for frame in log.frames()] == pytest.approx([0.02 * k for k in range(6)])
     assert log.labels == "recorded"  # without poses there is no expert
+
+
+def test_another_recording_in_the_folder_of_a_bag_is_named(tmp_path):
+    bag = write_ackermann(tmp_path / "drive", "ros2")
+    (part,) = open_log(bag).files
+    assert open_log(bag).notes == ()
+    other = shutil.copy(part, bag / f"earlier{part.suffix}")
+    (note,) = open_log(bag).notes
+    assert note == f"not read, as no part of this bag: {other.name}; give each of these files by itself"
+    assert open_log(bag).count == open_log(other).count
 
 
 @pytest.mark.parametrize(
