@@ -70,7 +70,6 @@ def _are_native(bench: WorldBench, put: Callable[[Panel, Rgb | None], None]) -> 
         put(standing, _texture())
         for view, (before, _) in zip(views, plain, strict=True):
             overlaps.append(_stands_there(bench, standing, view, before))
-        _drives_on(bench, place)
         put(sunk := _panel(bench, place, 0.0), _texture())
         hidden = _is_hidden_by_the_ground(bench, sunk, place, plain[0][0])
     finally:
@@ -78,6 +77,11 @@ def _are_native(bench: WorldBench, put: Callable[[Panel, Rgb | None], None]) -> 
     for view, (before, _) in zip(views, plain, strict=True):
         if not np.array_equal(world.observe_at(*view, depth=False)[0], before):
             raise NotMet("expected the scene as it was once a panel is taken out; got another picture")
+    try:  # the last, as what else moves in the world has moved then
+        put(standing, _texture())
+        _drives_on(bench, place)
+    finally:
+        put(standing, None)
     return (
         f"{100 * min(overlaps):.0f} % of its outline is where it should be, the right way round, at its depth; {100 * hidden:.0f} % where the ground hides "
         "its lower half"
