@@ -133,13 +133,7 @@ def landscape(
     names = {"kind": "landscape", "object": number, "grid": [axis.tolist() for axis in axes]}
     cells = _cells(len(points), total, file, _fingerprint(problem, theta, settings_hash, names), on_cell)
     shape = (len(axes[0]), len(axes[1]), len(axes[2]))
-    return Landscape(
-        number,
-        axes[0],
-        axes[1],
-        axes[2],
-        np.array([np.mean(cell) for cell in np.array(cells, float)]).reshape(shape),
-    )
+    return Landscape(number, axes[0], axes[1], axes[2], np.array(cells, float).mean(axis=1).reshape(shape))
 
 
 def robustness_map(

@@ -6,6 +6,7 @@ last |CTE| holds for the remaining ticks, capped, so that hitting a wall or the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -65,6 +66,11 @@ class Horizon:
     def __post_init__(self) -> None:
         if self.ticks < 1 or not min(self.dt_s, self.off_track_m, self.held_cap_m) > 0.0:
             raise ValueError(f"expected at least one tick and positive limits, got {self}")
+
+    def whole_ticks(self, time_s: float) -> int:
+        """Number of control ticks that are over after a time [s]."""
+        # 43 x 0.1 s / 0.1 s is a little less than 43.
+        return math.floor(time_s / self.dt_s + 1e-6)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Collection
 from typing import Any
@@ -12,6 +13,7 @@ from mcap.records import Channel, Header, Metadata, Schema
 from nodes.bags.records import (
     CHUNK_HEAD_BYTES,
     DATA_END_BYTES,
+    MAGIC,
     MESSAGE_HEAD,
     RECORD_HEAD,
     Damaged,
@@ -38,6 +40,16 @@ _KINDS: dict[int, Any] = {
 def only_zeros(buffer: Any, at: int) -> bool:
     """Whether only zeros follow, as after a power cut."""
     return _NOT_ZERO.search(buffer, at) is None
+
+
+def next_file(buffer: Any, at: int) -> int | None:
+    """Return the next offset from ``at`` on at which another MCAP file begins; None without one."""
+    while (at := buffer.find(MAGIC, at)) >= 0:
+        with contextlib.suppress(Damaged):
+            if record_at(buffer, at + len(MAGIC), len(buffer))[0] == Opcode.HEADER:
+                return at
+        at += 1
+    return None
 
 
 def next_record(buffer: Any, at: int, limit: int, channels: Collection[int], messages: bool) -> int | None:

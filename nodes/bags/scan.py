@@ -40,7 +40,15 @@ from nodes.bags.records import (
     records_of,
     unpack_chunk,
 )
-from nodes.bags.resync import is_cut, makes_sense, next_record, only_zeros, plausible_end, runs_over
+from nodes.bags.resync import (
+    is_cut,
+    makes_sense,
+    next_file,
+    next_record,
+    only_zeros,
+    plausible_end,
+    runs_over,
+)
 from nodes.bags.salvage import good_records
 from nodes.bags.scanned import BAD, CUT, JUNK, ZEROS, Loss, MessageRun, Piece, Scan, chunk_index
 from nodes.bags.summary import Ending, read_ending, read_summary_section
@@ -98,25 +106,15 @@ class _Scanner:
             except Damaged as error:
                 at = self._over_damage(at, str(error))
         self._close_chunk(at_end=True)
-        if self.found.data_end is not None:
-            self._find_another_file(at)
+        if self.found.data_end is not None and (other := next_file(self._buffer, at)) is not None:
+            # As cat leaves it: no reader sees its messages.
+            why = "it begins behind the end of this one; cut it out into a file of its own"
+            self.found.losses.append(Loss(other, self.found.size - other, "another recording", why, JUNK))
         if self.found.data_end is None and self.found.ending is not None:
             self.found.fixes.append("the record that ends the data was missing")
         restore_definitions(self.found)
         if self.found.known is not None and not self.found.summary_damage and not self.found.losses:
             self.found.summary_damage = contradiction(self.found, self.found.known)
-
-    def _find_another_file(self, after: int) -> None:
-        """Note a second recording behind the end of the first, as ``cat`` leaves it: no reader sees its messages."""
-        at = self._buffer.find(MAGIC, after)
-        while at >= 0:
-            with contextlib.suppress(Damaged):
-                opcode, _, _ = record_at(self._buffer, at + len(MAGIC), self.found.size)
-                if opcode == Opcode.HEADER:
-                    why = "it begins behind the end of this one; cut it out into a file of its own"
-                    self.found.losses.append(Loss(at, self.found.size - at, "another recording", why, JUNK))
-                    return
-            at = self._buffer.find(MAGIC, at + 1)
 
     def _begin(self) -> int:
         buffer, at = self._buffer, len(MAGIC)

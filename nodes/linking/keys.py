@@ -246,7 +246,7 @@ def _ignoring_what_is_no_key() -> Iterator[None]:
     except SecurityError:
         return
     except OSError as error:
-        if has_run_out(error):
+        if has_run_out(error.errno):
             raise
 
 

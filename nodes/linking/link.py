@@ -264,7 +264,7 @@ class Link:
         try:
             self._doors.open(right)
         except (OSError, zmq.ZMQError) as error:
-            if not has_run_out(error):
+            if not has_run_out(error.errno):
                 raise
             self._log.say(f"the {right} door cannot be opened now: {error.strerror}")
             self._locked_out[right] = time.monotonic()

@@ -15,7 +15,7 @@ from nodes.operator_page.config import PageConfig
 from nodes.runtime.clock import NS_PER_S
 
 _BEATS_KEPT = 64
-_STOPPED = "the emergency stop is latched; release it first"
+STOPPED = "the emergency stop is latched; release it first"
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class Desk:
 
     def _problem(self, picture_ns: int, mono_ns: int) -> str:
         if self.estop:
-            return _STOPPED
+            return STOPPED
         if not picture_ns:
             return "the page has shown no picture yet"
         age_s = (mono_ns - picture_ns) / NS_PER_S

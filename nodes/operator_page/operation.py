@@ -14,7 +14,7 @@ from nodes.launching.launched import Launched
 from nodes.operator_page.board import ViewState
 from nodes.operator_page.catalogue import CatalogueEntry
 from nodes.operator_page.client import ClientAct
-from nodes.operator_page.desk import Desk
+from nodes.operator_page.desk import STOPPED, Desk
 from nodes.operator_page.diary import Diary
 from nodes.operator_page.recording import LAUNCH_RECORDER, TELEOP, RecorderControl
 from nodes.operator_page.said import ChooseAttack, Hold, Label, Release, Stop, Take
@@ -245,7 +245,7 @@ class Operation:
         if self.board.armed or self.desk.held:
             return "the car is armed; release the button first", []
         if self.desk.estop:
-            return "the emergency stop is latched; release it first", []
+            return STOPPED, []
         self.trial.start()
         if not (self.launched.twin and self.start_pose):
             return "", []

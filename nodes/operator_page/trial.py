@@ -131,8 +131,7 @@ class Trial:
 
     def _ticks(self, time_s: float) -> int:
         """Whole control ticks of a time since the start, at most those of the trial."""
-        # 43 x 0.1 s / 0.1 s is a little less than 43.
-        return min(max(0, math.floor(time_s / self._horizon.dt_s + 1e-6)), self._horizon.ticks)
+        return min(max(0, self._horizon.whole_ticks(time_s)), self._horizon.ticks)
 
     def state(self) -> dict[str, Any]:
         """Describe the trial for the page."""

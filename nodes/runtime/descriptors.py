@@ -9,8 +9,6 @@ import errno
 import os
 import resource
 
-import zmq
-
 from nodes.runtime.errors import BusError
 
 # A ZeroMQ context with its first sockets and connections needs fewer.
@@ -19,9 +17,9 @@ _RESERVED = 32
 _RAN_OUT = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
-def has_run_out(error: OSError | zmq.ZMQError) -> bool:
-    """Whether an operation failed because there is no descriptor or memory left, so that it may succeed later."""
-    return error.errno in _RAN_OUT
+def has_run_out(number: int | None) -> bool:
+    """Whether an operation failed, by its errno, because there is no descriptor or memory left, so that it may succeed later."""
+    return number in _RAN_OUT
 
 
 def raise_limit() -> None:

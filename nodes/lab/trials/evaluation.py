@@ -103,8 +103,7 @@ def score(
     states: Array, path: DrivingPath, horizon: Horizon, stopped_after_s: float | None
 ) -> tuple[DriveMetrics, Array]:
     """Compute the metrics of a drive, and the states ``[ticks + 1, 3]``, with the last state held after an early stop."""
-    # 43 x 0.1 s / 0.1 s is a little less than 43.
-    stopped = None if stopped_after_s is None else int(np.floor(stopped_after_s / horizon.dt_s + 1e-6))
+    stopped = None if stopped_after_s is None else horizon.whole_ticks(stopped_after_s)
     metrics = drive_metrics(path, states, horizon, stopped)
     seen = len(states) if stopped is None else min(len(states), max(stopped, 1) + 1)
     held = np.repeat(states[seen - 1 : seen], max(0, horizon.ticks + 1 - seen), axis=0)
