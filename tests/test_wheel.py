@@ -174,7 +174,7 @@ class Installed:
             env=environment,
             capture_output=True,
             text=True,
-            timeout=600,
+            timeout=1700,
         )
         assert done.returncode == code, done.stdout + done.stderr
         assert "Traceback" not in done.stderr
@@ -211,3 +211,14 @@ def test_the_commands_work_for_a_user_without_a_home_among_files_of_strange_name
     advnerf("experiment", "run", "room", "--setting", "demo", "--until", "object", "--set", "scene.steps=20")
     assert (advnerf.folder / "runs" / "demo" / "scene" / "scene.safetensors").is_file()
     assert advnerf.listing() == before
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_demo_ends_with_its_report_for_a_user_without_a_home(wheel, open_folder):
+    advnerf = Installed(wheel, open_folder)
+    (advnerf.folder / "hardware.py").write_text("raise SystemExit('a stranger')\n")
+    shown = advnerf("demo").stdout
+    assert "report: " in shown
+    report = (advnerf.folder / "runs" / "demo" / "report" / "report.html").read_text()
+    assert "gradient" in report
