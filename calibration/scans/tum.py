@@ -18,7 +18,7 @@ from advnerf_core.data.lens import Lens
 from advnerf_core.data.scan_folder import trajectories
 from advnerf_core.documents import read_text
 from advnerf_core.geometry import Array, Pinhole
-from calibration.scans.depth import DepthView, depth_points
+from calibration.scans.depth import DepthView, depth_points, disagreement
 from calibration.scans.scan import Scan, ScanError, ScanOptions, images_in, lens_of, model_of, pinhole_of
 from calibration.scans.timed_images import Placed, TimedImage, place_images
 from calibration.scans.trajectory import Trajectory, require_order, stamp_ns, trajectory_of
@@ -32,7 +32,10 @@ _UNKNOWN = (
 )
 _LISTS, _FOLDERS = ("rgb.txt", "images.txt"), ("rgb", "images", "image_0", ".")
 _DEPTH_LIST, _CALIBRATION = "depth.txt", "calibration.txt"
-_VALUES_PER_M, _FARTHEST_M = 5000.0, 5.0
+# The benchmark's scale, and millimetres, as RealSense and ROS write them.
+_VALUES_PER_M, _FARTHEST_M = (5000.0, 1000.0), 5.0
+# The millimetre is taken if views agree so much better by it; above the share, they agree by no scale.
+_CLEARLY, _MOST_DISAGREEMENT = 0.5, 0.2
 _DEPTH_WITHIN_NS = 20_000_000
 # https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats: fx, fy, cx, cy and k1, k2, p1, p2, k3 of the colour cameras.
 _FREIBURG = {
@@ -56,8 +59,10 @@ def read(path: Path, options: ScanOptions) -> Scan:
     if trajectory.file.name != _METRIC:
         model = model_of(placed.images, placed.left_out, path)
         return Scan(model, placed.pictures, _UNKNOWN.format(file=trajectory.file.name), facts=facts)
-    model = model_of(placed.images, placed.left_out, path, _depth(path, placed))
-    return Scan(model, placed.pictures, "metric: lengths of the trajectory", True, np.eye(3), facts=facts)
+    points, said = _depth(path, placed)
+    model = model_of(placed.images, placed.left_out, path, points)
+    unit = f"metric: lengths of the trajectory{said}"
+    return Scan(model, placed.pictures, unit, True, np.eye(3), facts=facts)
 
 
 def _trajectory(path: Path) -> Trajectory:
@@ -155,10 +160,10 @@ def _intrinsics(path: Path, options: ScanOptions, image: Path) -> tuple[Pinhole,
     return pinhole, lens_of(pinhole, lens, where)
 
 
-def _depth(path: Path, placed: Placed) -> Array:
-    """Points of the depth images, which are aligned with the colour images."""
+def _depth(path: Path, placed: Placed) -> tuple[Array, str]:
+    """Points ``[M, 3]`` of the depth images, which are aligned with the colour images, and their scale in words."""
     if not (path / _DEPTH_LIST).is_file():
-        return np.zeros((0, 3))
+        return np.zeros((0, 3)), ""
     depth = sorted(_listed(path / _DEPTH_LIST))
     stamps = np.array([stamp for stamp, _ in depth], np.int64)
     views = []
@@ -166,4 +171,18 @@ def _depth(path: Path, placed: Placed) -> Array:
         if len(stamps) and np.abs(stamps - stamp).min() <= _DEPTH_WITHIN_NS:
             file = depth[int(np.abs(stamps - stamp).argmin())][1]
             views.append(DepthView(file, image.pinhole, image.T_world_from_camera))
-    return depth_points(views, _VALUES_PER_M, _FARTHEST_M)
+    scale = _scale(views, path)
+    points = depth_points(views, scale, _FARTHEST_M)
+    return points, f"; depth images have {scale:g} values per metre" if len(points) else ""
+
+
+def _scale(views: list[DepthView], path: Path) -> float:
+    """Values of a pixel at one metre, which no file says: by them, views from different places agree."""
+    usual, other = ((disagreement(views, each, _FARTHEST_M), each) for each in _VALUES_PER_M)
+    differ, scale = other if other[0] < _CLEARLY * usual[0] else usual
+    if differ > _MOST_DISAGREEMENT:
+        raise ScanError(
+            f"{path / _DEPTH_LIST}: expected depth images of {_VALUES_PER_M[0]:g} values per metre, or in millimetres, got ones that differ by "
+            f"{100 * differ:.0f} % between views by either; convert them, or remove the file: points of the scene help only to find the ground"
+        )
+    return scale

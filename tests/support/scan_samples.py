@@ -60,14 +60,18 @@ def write_image(file: Path, number: int, size: tuple[int, int] = (WIDTH, HEIGHT)
     assert cv2.imwrite(str(file), picture(number, size))
 
 
-def depth_of_floor(T: Array, width: int, height: int) -> Array:
-    """Planar depth [m] of the floor z = 0; 0 where the camera sees none."""
+def rays(width: int, height: int) -> Array:
+    """Rays ``[H, W, 3]`` of the pixels in the camera, of depth 1."""
     scale = np.array([width / WIDTH, height / HEIGHT])
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack(
+    return np.stack(
         [(u / scale[0] - K[0, 2]) / K[0, 0], (v / scale[1] - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1
     )
-    down = rays @ T[2, :3]
+
+
+def depth_of_floor(T: Array, width: int, height: int) -> Array:
+    """Planar depth [m] of the floor z = 0; 0 where the camera sees none."""
+    down = rays(width, height) @ T[2, :3]
     return np.where(down < -1e-3, -T[2, 3] / np.minimum(down, -1e-3), 0.0)
 
 

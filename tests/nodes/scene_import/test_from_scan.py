@@ -289,6 +289,42 @@ def test_depth_images_of_tum_show_the_ground(tmp_path):
     assert_same_pixels(frames, TRUTH)
 
 
+@pytest.mark.parametrize("values_per_m", [1000.0, 5000.0])
+def test_depth_images_of_tum_may_be_in_millimetres(tmp_path, values_per_m):
+    """The camera keeps its height, so that wrong scales give a plane too: only the wall tells them apart."""
+    scan = scan_samples.tum(tmp_path / "scan", depth=True)
+    rows = np.loadtxt(scan / "groundtruth.txt")
+    rows[:, 3] = 1.5
+    np.savetxt(scan / "groundtruth.txt", rows, fmt="%.9f")
+    for file, T in zip(sorted((scan / "depth").iterdir()), TRUTH, strict=True):
+        level = T.copy()
+        level[2, 3] = 1.5
+        depth_m = scan_samples.depth_of_floor(level, WIDTH, HEIGHT)
+        rays = scan_samples.rays(WIDTH, HEIGHT)
+        for axis, at in ((0, -4.0), (0, 4.0), (1, -4.0), (1, 4.0)):
+            towards = rays @ level[axis, :3]
+            with np.errstate(divide="ignore"):
+                wall_m = (at - level[axis, 3]) / towards
+            nearer = (wall_m > 0.0) & ((depth_m == 0.0) | (wall_m < depth_m))
+            depth_m = np.where(nearer, wall_m, depth_m)
+        cv2.imwrite(str(file), np.round(values_per_m * depth_m).clip(0, 65535).astype(np.uint16))
+    frames, report = run(tmp_path, scan)
+    assert report["ground_at_zero"]
+    heights_m = [frame.T_world_from_camera[2, 3] for frame in frames]
+    np.testing.assert_allclose(heights_m, 1.5, atol=0.005)
+    assert f"depth images have {values_per_m:g} values per metre" in report["scale"]
+
+
+def test_depth_images_in_another_unit_are_refused(tmp_path):
+    scan = scan_samples.tum(tmp_path / "scan", depth=True)
+    for file in sorted((scan / "depth").iterdir())[::2]:
+        cv2.imwrite(str(file), cv2.imread(str(file), cv2.IMREAD_UNCHANGED) // 40)
+    with pytest.raises(
+        AdvnerfError, match=r"depth.txt: expected depth images of 5000 values per metre, or in mill"
+    ):
+        run(tmp_path, scan)
+
+
 def test_kinects_of_the_benchmark_are_known(tmp_path):
     scan = scan_samples.tum(tmp_path / "rgbd_dataset_freiburg1_desk")
     (scan / "calibration.txt").unlink()
