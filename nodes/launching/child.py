@@ -75,6 +75,12 @@ class Child:
             self._process = self._spawn(command, environment, log)
         self.started_at, self.status, self.status_at, self.restart_at = time.monotonic(), None, None, None
 
+    def excuse(self, pause_s: float) -> None:
+        """Leave a time [s] in which nobody listened out of the time since the start and the last status."""
+        self.started_at += pause_s
+        if self.status_at is not None:
+            self.status_at += pause_s
+
     @staticmethod
     def _spawn(command: list[str], environment: dict[str, str], log: IO[bytes]) -> subprocess.Popen[bytes]:
         return subprocess.Popen(

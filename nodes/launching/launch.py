@@ -30,6 +30,8 @@ from nodes.runtime.topics import status_topic
 
 _POLL_S = 0.05
 _SIGINT_S, _SIGTERM_S = 5.0, 2.0
+# A longer pause of the supervisor (Ctrl-Z, a busy computer) is no silence of the nodes: what they sent meanwhile has not been delivered yet.
+_HELD_UP_S = 0.5
 _UP = ("ready", "active")
 
 
@@ -65,6 +67,7 @@ class Launch:
         self._stopping = self._impatient = False
         self._started, self._ready, self._done = threading.Event(), threading.Event(), threading.Event()
         self._tasks: SimpleQueue[tuple[Callable[[], None], threading.Event]] = SimpleQueue()
+        self._looked_at: float | None = None
         self._thread = threading.Thread(target=self._supervise, name="supervisor", daemon=True)
         self._lock: TextIO | None = None
         self._card: Path | None = None
@@ -220,6 +223,7 @@ class Launch:
             task()
             finished.set()
         now = time.monotonic()
+        self._excuse_pause(now)
         for received in bus.receive():
             child = self._children[received.topic.rsplit("/", 1)[-1]]
             status = received.message()
@@ -230,6 +234,16 @@ class Launch:
         if not self._ready.is_set() and not self._stopping and not self._what_is_missing():
             self._ready.set()
             self._report("all nodes are ready")
+
+    def _excuse_pause(self, now: float) -> None:
+        """Do not count the time in which the supervisor itself did not run as silence of its nodes, which would be killed for it."""
+        pause_s = 0.0 if self._looked_at is None else now - self._looked_at
+        self._looked_at = now
+        if pause_s <= _HELD_UP_S:
+            return
+        for child in self._children.values():
+            child.excuse(pause_s)
+        self._report(f"the launch was held up for {pause_s:.1f} s; its nodes went on")
 
     def _look_after(self, child: Child, now: float) -> None:
         if child.restart_at is not None:

@@ -7,27 +7,22 @@ topic lists of the gateways follow from the topic table, which has the publisher
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from advnerf_core.documents import Document
-from nodes.launching.launch_schema import LaunchFile
+from nodes.launching.launch_schema import LaunchFile, NodeEntry
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
 
 GATEWAY = "gateway"
 ALL_HOSTS = "all"
-_OPERATOR = "operator"
+_OPERATOR, _HAND = "operator", "teleop"
+_PAGE_MODULE, _ROS2_MODULE = "nodes.page", "nodes.ros2"
 _HOST_COUNT = 2
 # The safety node must run on the motor's computer, so that the network cannot come between the check and the motor.
 _TOGETHER = ("safety", "motor")
 _SAFETY_MODULE = "nodes.safety"
 _COMMANDS = ("/policy/drive", "/expert/drive")
-
-
-class _Entry(Protocol):
-    module: str
-    host: str | None
-    enabled: bool
 
 
 def choose_host(document: Document, launch: LaunchFile, host: str | None) -> None:
@@ -90,11 +85,16 @@ def routes(launch: LaunchFile, host: str) -> tuple[list[str], list[str]]:
     operator = operator_of(launch)
     exports, imports = [], []
     entries = {name: entry for name, entry in launch.nodes.items() if entry.enabled}
+    from_ros2 = _taken_from_ros2(entries)
     for topic, row in TOPICS.items():
-        if row.publisher == GATEWAY:
-            source: str | None = listener
+        if topic in from_ros2:
+            source = from_ros2[topic]
+        elif row.publisher == GATEWAY:
+            source = listener
         elif row.publisher == _OPERATOR:
             source = operator
+        elif row.publisher == _HAND:
+            source = _hand_of(entries) or operator
         else:
             source = _host_of(row.publisher, entries)
         if source == host:
@@ -112,7 +112,33 @@ def operator_of(launch: LaunchFile) -> str:
     return launch.operator or next(name for name in launch.hosts if name != listener)
 
 
-def _host_of(role: str, entries: Mapping[str, _Entry]) -> str | None:
+def _taken_from_ros2(entries: Mapping[str, NodeEntry]) -> dict[str, str | None]:
+    """Hosts of the topics that ROS 2 supplies instead of a node of ours."""
+    return {
+        route["topic"]: entry.host
+        for entry in entries.values()
+        if entry.module == _ROS2_MODULE
+        for route in entry.config.get("take") or ()
+        if isinstance(route, dict) and "topic" in route
+    }
+
+
+def _hand_of(entries: Mapping[str, NodeEntry]) -> str | None:
+    """Host of the node at which the operator holds a button and presses the e-stop: the operator page, or a teleop node."""
+    pages = _operating_pages(entries)
+    return next(iter(pages.values())) if pages else _host_of(_HAND, entries)
+
+
+def _operating_pages(entries: Mapping[str, NodeEntry]) -> dict[str, str | None]:
+    """Hosts of the pages that operate, by the nodes' names."""
+    return {
+        name: entry.host
+        for name, entry in entries.items()
+        if entry.module == _PAGE_MODULE and entry.config.get("role", "operate") == "operate"
+    }
+
+
+def _host_of(role: str, entries: Mapping[str, NodeEntry]) -> str | None:
     """Host of the node with a role, found by the node's name or module."""
     for name, entry in entries.items():
         if role in (name, entry.module.rsplit(".", 1)[-1]):
@@ -173,3 +199,21 @@ def _check(document: Document, launch: LaunchFile, host: str | None) -> None:
         raise ConfigError(
             f"{place}: expected safety and motor on one host, so that no network lies between them; got {homes}"
         )
+    _check_pages(document, launch, enabled, homes.get("safety"))
+
+
+def _check_pages(
+    document: Document, launch: LaunchFile, entries: Mapping[str, NodeEntry], safety: str | None
+) -> None:
+    """Refuse a page whose requests, and whose e-stop, would not reach the safety node."""
+    pages = _operating_pages(entries)
+    if len(set(pages.values())) > 1:
+        raise ConfigError(
+            f"{document.place(('nodes',))}: expected one operator page, got {pages}; give the others role: watch"
+        )
+    for name, home in pages.items():
+        if safety is not None and home not in (safety, operator_of(launch)):
+            raise ConfigError(
+                f"{document.place(('nodes', name))}: expected the page {name} on {operator_of(launch)}, from where people arm, got {home}: its e-stop "
+                f"would not reach the car; set operator: {home}"
+            )

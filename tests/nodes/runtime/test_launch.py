@@ -225,6 +225,34 @@ def test_kill_of_the_supervisor_leaves_no_process(probe, tmp_path):
     assert_gone(pids)
 
 
+def test_a_supervisor_that_was_held_up_does_not_kill_its_nodes_for_it(probe, tmp_path):
+    """Ctrl-Z and fg stop the launch alone, as its nodes are in groups of their own: they went on, and what they sent is still to be delivered."""
+    entries = {f"n{number}": {"hang_timeout_s": 2.0} for number in range(4)}
+    file = write(tmp_path / "a.launch.yaml", **entries)
+    script = (
+        "import sys; from pathlib import Path; from nodes.launching.launch import Launch\n"
+        "launch = Launch(Path(sys.argv[1]), run_dir=Path(sys.argv[2]), report=lambda line: print(line, flush=True))\n"
+        "launch.start(); launch.wait_ready(120); print('ready', *launch.pids.values(), flush=True)\n"
+        "sys.stdin.readline(); print('still', *launch.pids.values(), flush=True); launch.stop(); print(launch.failure)"
+    )
+    command = [sys.executable, "-c", script, file, tmp_path / "run"]
+    supervisor = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        lines = iter(supervisor.stdout.readline, "")
+        pids = next(line.split()[1:] for line in lines if line.startswith("ready"))
+        for _ in range(2):
+            supervisor.send_signal(signal.SIGSTOP)
+            time.sleep(3.0)
+            supervisor.send_signal(signal.SIGCONT)
+            time.sleep(0.5)
+        said = supervisor.communicate("\n", timeout=120)[0]
+    finally:
+        supervisor.kill()
+    assert f"still {' '.join(pids)}" in said
+    assert said.count("the launch was held up for ") == 2
+    assert "hung" not in said
+
+
 def test_wrong_key_in_a_node_names_the_launch_file_and_line(probe, tmp_path):
     file = write(tmp_path / "a.launch.yaml", a={"config": {"rate": 3}})
     line = file.read_text().splitlines().index("      rate: 3") + 1

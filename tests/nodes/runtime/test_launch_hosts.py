@@ -87,6 +87,68 @@ def test_people_may_be_at_the_car(launch_file):
     assert "/arm" in robot["exports"]
 
 
+PAGE = "  page: {module: nodes.page, host: HOST, config: {role: ROLE}}\n"
+
+
+def with_pages(*pages, operator="workstation"):
+    added = "".join(
+        PAGE.replace("page:", f"page_{host}:").replace("HOST", host).replace("ROLE", role)
+        for host, role in pages
+    )
+    return f"{FILE}{added}operator: {operator}\n"
+
+
+@pytest.mark.parametrize(
+    ("pages", "operator", "source"),
+    [
+        ([], "workstation", "workstation"),
+        ([], "robot", "robot"),
+        ([("workstation", "operate")], "workstation", "workstation"),
+        ([("robot", "operate")], "workstation", "robot"),
+        ([("robot", "operate"), ("workstation", "watch")], "workstation", "robot"),
+    ],
+)
+def test_the_button_and_the_e_stop_reach_the_car_from_where_people_operate(
+    launch_file, pages, operator, source
+):
+    file = launch_file(with_pages(*pages, operator=operator))
+    robot, workstation = gateway(file, "robot")[1], gateway(file, "workstation")[1]
+    from_, to = (robot, workstation) if source == "robot" else (workstation, robot)
+    assert "/teleop/state" in from_["exports"]
+    assert "/teleop/state" in to["imports"]
+
+
+@pytest.mark.parametrize(
+    ("pages", "operator", "words"),
+    [
+        (
+            [("workstation", "operate")],
+            "robot",
+            "expected the page page_workstation on robot, .* set operator: workstation",
+        ),
+        (
+            [("robot", "operate"), ("workstation", "operate")],
+            "workstation",
+            "expected one operator page, got",
+        ),
+    ],
+)
+def test_a_page_whose_e_stop_would_not_reach_the_car_is_refused(launch_file, pages, operator, words):
+    with pytest.raises(ConfigError, match=words):
+        load_launch(launch_file(with_pages(*pages, operator=operator)), host="robot")
+
+
+def test_topics_that_ros2_supplies_come_from_its_host(launch_file):
+    taken = "{take: [{topic: /vicon/car, name: /pose, type: geometry_msgs/msg/PoseStamped}]}"
+    text = FILE.replace(
+        "  vicon: {module: nodes.vicon, host: robot}",
+        f"  ros2: {{module: nodes.ros2, host: workstation, config: {taken}}}",
+    )
+    file = launch_file(text)
+    assert "/vicon/car" in gateway(file, "workstation")[1]["exports"]
+    assert "/vicon/car" in gateway(file, "robot")[1]["imports"]
+
+
 @pytest.mark.parametrize(
     ("change", "host", "words"),
     [
@@ -159,7 +221,7 @@ def test_without_keys_the_other_host_can_only_watch(launch_file):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("operator: robot\n", ""), "without keys .* robot would accept /arm"),
+        (("operator: robot\n", ""), "without keys .* robot would accept .*/arm"),
         (("nodes.policy, host: robot", "nodes.policy, host: desk"), "robot would accept /policy/drive"),
     ],
 )
