@@ -27,6 +27,10 @@ _MIN_RAY_ANGLE_RAD = np.radians(2.0)
 _MAX_SIDE_SPREAD = 0.1
 # Known positions that fit worse than this share of their extent belong to something else.
 _MAX_POSITION_SHARE = 0.1
+# One position is wrong if the others fit this much better without it, by more than a share of their extent.
+_MUCH_BETTER, _MIN_FOR_OUTLIER, _OUTLIER_SHARE = 4.0, 8, 0.005
+# Up of the cameras in a world with z up; one below this is upside down.
+_UPSIDE_DOWN = -0.5
 _SHOWN = 4
 
 
@@ -112,7 +116,30 @@ def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: 
             f"expected positions that fit the model, got distances of {rms:.3g} m (rms) over {spread:.3g} m, the largest "
             f"{errors[worst]:.3g} m at {images[worst].name}; correct the file: metres, x, y and z up in a right-handed frame"
         )
+    if (similarity.T_target_from_source[:3, :3] @ up)[2] < _UPSIDE_DOWN:
+        raise ReconstructionError(
+            "expected positions in a right-handed frame with z up, got ones by which the cameras stand on their heads: are x and y exchanged "
+            "(north before east), or is one of them reversed? Correct the file"
+        )
+    _refuse_outlier(source, target, up, errors, [each.name for each in images])
     return PositionFit(similarity, len(images), rms, float(errors[worst]), images[worst].name, on_line)
+
+
+def _refuse_outlier(source: Array, target: Array, up: Array, errors: Array, names: list[str]) -> None:
+    """Refuse a position ``[3]`` without which the others fit much better: a wrong row would tilt and scale the whole model."""
+    worst = int(np.argmax(errors))
+    spread = float(np.linalg.norm(np.ptp(target, axis=0)))
+    if len(names) < _MIN_FOR_OUTLIER or errors[worst] < _OUTLIER_SHARE * spread:
+        return
+    others = np.arange(len(names)) != worst
+    similarity, _ = fit_positions(source[others], target[others], up)
+    distances = np.linalg.norm(similarity.points(source) - target, axis=1)
+    rms_m, without_m = (float(np.sqrt(np.mean(each**2))) for each in (errors, distances[others]))
+    if without_m * _MUCH_BETTER < rms_m:
+        raise ReconstructionError(
+            f"expected positions that fit each other, got one of {names[worst]} that is {distances[worst]:.3g} m away from where the others, which fit "
+            f"to {without_m:.2g} m (rms), put it; correct its row, or remove it"
+        )
 
 
 @dataclass(frozen=True)

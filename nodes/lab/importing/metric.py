@@ -18,12 +18,14 @@ from advnerf_core.errors import ConfigError
 from advnerf_core.geometry import Array
 from calibration.known_scale import View, fit_known_positions, length_scale, marker_scale
 from calibration.photo_model import Model
-from calibration.world_axes import Ground, find_ground, on_ground, upright
+from calibration.world_axes import Ground, cameras_up, find_ground, on_ground, upright
 from nodes.lab.importing.errors import ImportRecordingError
 from nodes.lab.importing.metric_options import MetricOptions
 
 # A scan's own metre is off by a few percent; more is another place, or another unit.
 _MOST_RESCALED = 2.0
+# Cameras that people or robots hold point down by less than 75 degrees: their tops are this much up.
+_LEAST_UP, _SAME_WAY = 0.25, 0.8
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ def place(
         R_upright_from_model: Rotation ``[3, 3]`` to z up, if the model knows gravity.
     """
     known = R_upright_from_model if options.up == "auto" else None
+    if known is not None:
+        _require_upright(known, model)
     ground = _ground(model, options, known)
     if options.positions is not None:
         return _at_positions(model, options.positions, ground, otherwise)
@@ -77,6 +81,17 @@ def place(
     said += _rescaled(scale, otherwise)
     similarity = on_ground(model, ground, scale) if known is None else upright(known, model, ground, scale)
     return similarity, _facts(said, scale_from, up, ground is not None)
+
+
+def _require_upright(R_upright_from_model: Array, model: Model) -> None:
+    """Refuse a world in which all cameras lie on their sides the same way. A camera that is mounted turned points its top elsewhere in every bend."""
+    tops = -model.poses[:, :3, 1].mean(axis=0)
+    up = R_upright_from_model[2] @ cameras_up(model.poses)
+    if up < _LEAST_UP and np.linalg.norm(tops) > _SAME_WAY:
+        raise ImportRecordingError(
+            f"expected a scan whose z is up, got cameras whose tops point {np.degrees(np.arccos(np.clip(up, -1.0, 1.0))):.0f} degrees away from it: "
+            "its world probably has y up; turn it, or give --up cameras"
+        )
 
 
 def _ground(model: Model, options: MetricOptions, known: Array | None) -> Ground | None:

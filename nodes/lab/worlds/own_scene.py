@@ -112,6 +112,12 @@ class OwnScene(Undriven):
                 f"expected drives that start in the learned box, x {low[0]:g} to {high[0]:g} m and y {low[1]:g} to {high[1]:g} m, "
                 f"got x = {start[0]:g} m, y = {start[1]:g} m; are scene and room calibration in one frame?"
             )
+        height_m = float(camera.mount[2, 3])
+        if not box.min_m[2] <= height_m <= box.max_m[2]:
+            raise WorldError(
+                f"expected a driving camera in the learned box, z {box.min_m[2]:g} to {box.max_m[2]:g} m, got one {height_m:g} m above the ground; "
+                "is the ground of the scene at z = 0, and its metre right? If so, correct the camera's mount"
+            )
         return WorldDescription(
             paths={PATH: _reference(room.reference_path, start, self.config.goal)},
             off_track_m=room.off_track_m,

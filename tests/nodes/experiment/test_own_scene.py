@@ -3,6 +3,7 @@
 import shutil
 
 import pytest
+import yaml
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.documents import read_json
@@ -15,7 +16,7 @@ from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
 from nodes.experiment.steps.shared_search import search_key
 from nodes.runtime.progress import ProgressDisplay
-from tests.support.tiny_request import loaded, tiny_request
+from tests.support.tiny_request import CALIBRATION, loaded, tiny_request
 
 CHANGES = ["over.method=[none, random, gradient]", "measure.starts=1", "attack.evaluations=2"]
 
@@ -75,3 +76,15 @@ def test_a_start_outside_the_learned_box_is_refused(tmp_path):
     file = tiny_request(tmp_path)
     with pytest.raises(WorldError, match=r"expected drives that start in the learned box, .* got x = 70 m"):
         load_experiment(file, None, ["world.start=[70, 0, 0]"], tmp_path / "run")
+
+
+def test_a_driving_camera_outside_the_learned_box_is_refused(tmp_path):
+    file = tiny_request(tmp_path)
+    camera = yaml.safe_load((CALIBRATION / "camera.yaml").read_text())
+    for height_m in (-0.4, 3.0):
+        camera["T_car_from_camera"][2][3] = height_m
+        (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera))
+        with pytest.raises(
+            WorldError, match=rf"expected a driving camera in the learned box, .* got one {height_m:g} m"
+        ):
+            load_experiment(file, None, [f"world.camera={tmp_path / 'camera.yaml'}"], tmp_path / "run")

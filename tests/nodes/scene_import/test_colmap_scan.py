@@ -168,6 +168,33 @@ def test_positions_of_something_else_are_refused(tmp_path, ring):
         run(tmp_path, *ring, positions=wrong)
 
 
+SWAPPED = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def test_positions_in_a_left_handed_frame_are_refused(tmp_path, ring):
+    """On a level drive the mirrored positions fit exactly, by a world that is upside down."""
+    wrong = write_positions(tmp_path / "gps.csv", [SWAPPED @ T for T in RING])
+    with pytest.raises(AdvnerfError, match=r"stand on their heads: are x and y exchanged"):
+        run(tmp_path, *ring, positions=wrong)
+
+
+def test_a_wrong_row_among_known_positions_is_named(tmp_path, ring):
+    rows = [T.copy() for T in RING]
+    rows[2][0, 3] += 0.6  # below the share of their extent at which positions do not fit the model at all
+    wrong = write_positions(tmp_path / "gps.csv", rows)
+    with pytest.raises(AdvnerfError, match=rf"got one of {NAMES[2]} that is 0\.6 m away .* correct its row"):
+        run(tmp_path, *ring, positions=wrong)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_positions_with_the_errors_of_satellites_are_no_wrong_rows(tmp_path, ring, seed):
+    noise = 0.05 * np.random.default_rng(seed).normal(size=(len(RING), 3))
+    noisy = [T.copy() for T in RING]
+    for T, error in zip(noisy, noise, strict=True):
+        T[:3, 3] += error
+    run(tmp_path, *ring, positions=write_positions(tmp_path / "gps.csv", noisy))
+
+
 def test_positions_with_the_origin_of_a_map_are_refused(tmp_path, ring):
     """The data set would take over a world that no command reads."""
     far = [T + np.array([[0, 0, 0, 5e5], [0, 0, 0, 5.4e6], [0, 0, 0, 0], [0, 0, 0, 0]]) for T in RING]

@@ -325,6 +325,22 @@ def test_depth_images_in_another_unit_are_refused(tmp_path):
         run(tmp_path, scan)
 
 
+def test_a_trajectory_with_y_up_is_refused(tmp_path):
+    scan = scan_samples.tum(tmp_path / "scan", depth=True)
+    rows = np.loadtxt(scan / "groundtruth.txt")
+    y_up = scan_samples.Y_UP[:3, :3]
+    rows[:, 1:4] = rows[:, 1:4] @ y_up.T
+    rows[:, 4:] = (Rotation.from_matrix(y_up) * Rotation.from_quat(rows[:, 4:])).as_quat()
+    np.savetxt(scan / "groundtruth.txt", rows, fmt="%.9f")
+    with pytest.raises(
+        AdvnerfError, match=r"tops point (8|9)\d degrees away from it: .* or give --up cameras"
+    ):
+        run(tmp_path, scan)
+    frames, _ = run(tmp_path, scan, up="cameras")
+    tops = [-frame.T_world_from_camera[2, 1] for frame in frames]
+    assert min(tops) > 0.8
+
+
 def test_kinects_of_the_benchmark_are_known(tmp_path):
     scan = scan_samples.tum(tmp_path / "rgbd_dataset_freiburg1_desk")
     (scan / "calibration.txt").unlink()
