@@ -76,9 +76,10 @@ def load_transforms(path: str | Path, require_all: bool = False) -> PosedImages:
     first = sets[0]
     frames = tuple(frame for each in sets for frame in each.frames)
     missing = tuple(name for each in sets for name in each.missing)
-    _refuse_far_away(files[0][0], frames)
     ignored = tuple(dict.fromkeys(key for each in sets for key in each.ignored))
-    return PosedImages(frames, missing, first.aabb_scale, first.scale, first.offset, first.file, ignored)
+    listed = PosedImages(frames, missing, first.aabb_scale, first.scale, first.offset, first.file, ignored)
+    _refuse_far_away(listed)
+    return listed
 
 
 def _files(path: Path) -> list[tuple[Path, str | None]]:
@@ -242,11 +243,12 @@ def _pose(values: _Values) -> Array:
     return np.asarray(matrix @ OPENGL_FROM_OPENCV, np.float64)
 
 
-def _refuse_far_away(path: Path, frames: Sequence[PosedImage]) -> None:
-    places = np.stack([frame.T_world_from_camera[:3, 3] for frame in frames])
+def _refuse_far_away(listed: PosedImages) -> None:
+    places = np.stack([frame.T_world_from_camera[:3, 3] for frame in listed.frames])
     if (wrong := far_from_origin(places)) is not None:
         farthest, problem = wrong
-        raise DatasetError(f"{path}: frame {frames[farthest].path.name}: transform_matrix: {problem}")
+        name = listed.name_of(listed.frames[farthest])
+        raise DatasetError(f"{listed.file}: frame {name}: transform_matrix: {problem}")
 
 
 def _lens(values: _Values) -> Lens:

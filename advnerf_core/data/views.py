@@ -93,13 +93,18 @@ class PosedImages:
         masks = [frame.mask for frame in self.frames if frame.mask is not None]
         return [*([] if self.file is None else [self.file]), *(frame.path for frame in self.frames), *masks]
 
+    def name_of(self, frame: PosedImage) -> str:
+        """The path of an image from the folder of the list, with slashes: several folders may have files of one name."""
+        path = frame.path if self.file is None else Path(os.path.relpath(frame.path, self.file.parent))
+        return path.as_posix()
+
     @property
     def remarks(self) -> list[str]:
         """Unused parts of the file, in lines for its user."""
         lines = [f"skipped, file not found: {path}" for path in self.missing]
         if self.ignored:
             lines.append(f"no effect here: the keys {', '.join(self.ignored)} of {self._name}")
-        left = [frame.path.name for frame in self.frames if frame.split is None]
+        left = [self.name_of(frame) for frame in self.frames if frame.split is None]
         if left and {TRAIN} < set(self.splits):
             lines.append(
                 f"not used: {len(left)} of {len(self.frames)} images, which are in no split of {self._name}: {left[0]}, ..."

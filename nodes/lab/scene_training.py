@@ -77,7 +77,7 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     }
     save_scene(request.output / SCENE, trained.scene, trained.occupied, metadata)
     if trained.gains is not None:
-        names = [frame.path.name for frame in training.frames]
+        names = [training.name_of(frame) for frame in training.frames]
         rows = [
             {"image": name, "gain": gain.tolist()} for name, gain in zip(names, trained.gains, strict=True)
         ]
@@ -101,7 +101,7 @@ def evaluate(renderer: FieldRenderer | SplatRenderer, listed: PosedImages, views
     """
     # Images with alpha are compared over white, which the renderer uses too.
     rows = [
-        {"image": listed.frames[index].path.name, **_compared(renderer, views, index, real)}
+        {"image": listed.name_of(listed.frames[index]), **_compared(renderer, views, index, real)}
         for index, real in enumerate(views.on_background(_WHITE))
     ]
     return {"mean": {key: float(np.mean([row[key] for row in rows])) for key in _MEASURES}, "images": rows}

@@ -72,7 +72,7 @@ class SceneView:
         self._show_cameras = self._server.gui.add_checkbox("cameras", views is not None)
         self._frustums: list[Any] = []
         if views is not None:
-            self._add_cameras(views.load(), [frame.path.name for frame in views.frames])
+            self._add_cameras(views.load(), [views.name_of(frame) for frame in views.frames])
         if room is not None:
             self._add_path(load_calibration(RoomCalibration, room))
         self._mode.on_update(lambda event: self._refresh())

@@ -108,8 +108,8 @@ def load_pictures(listed: PosedImages, size: tuple[int, int] | None = None) -> P
         view = load_view(frames[index], size)
         if view.rgb.shape != first.rgb.shape:
             raise FitError(
-                f"expected pictures of one size, got {_size(first)} in {frames[0].path.name} and {_size(view)} in "
-                f"{frames[index].path.name}; give --size WIDTH HEIGHT to bring them to one"
+                f"expected pictures of one size, got {_size(first)} in {listed.name_of(frames[0])} and {_size(view)} in "
+                f"{listed.name_of(frames[index])}; give --size WIDTH HEIGHT to bring them to one"
             )
         _write_premultiplied(view, images[index])
         pinholes[index], cut_out[index] = view.pinhole, view.alpha is not None

@@ -52,6 +52,18 @@ def test_blender_folder_with_its_splits(tmp_path):
     assert listed.load().alpha.shape == (6, HEIGHT, WIDTH)
 
 
+def test_images_of_one_name_in_several_folders_have_names_of_their_own(tmp_path, monkeypatch):
+    paths = ["left/0.png", "right/0.png", "../beside/0.png", str(tmp_path / "far" / "0.png")]
+    frames = [{"file_path": path, "transform_matrix": pose(k)} for k, path in enumerate(paths)]
+    (tmp_path / "set").mkdir()
+    file = write(tmp_path / "set", frames)
+    monkeypatch.chdir(tmp_path / "set")
+    for given in (file, Path("transforms.json")):
+        listed = load_transforms(given)
+        names = [listed.name_of(frame) for frame in listed.frames]
+        assert names == ["left/0.png", "right/0.png", "../beside/0.png", "../far/0.png"]
+
+
 def test_nerfstudio_lists_of_splits(tmp_path):
     frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in range(4)]
     listed = load_transforms(

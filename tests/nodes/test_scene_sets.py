@@ -1,0 +1,64 @@
+"""`advnerf scene eval|render|view|match-colours` with sets of photographs of all kinds, in a scene that nobody trained."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from nodes.lab.scene_view import SceneView
+from tests.support.commands import advnerf
+from tests.support.opaque_scene import INSIDE, write_frames, write_scene
+
+Command = Callable[..., tuple[object, str, str]]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return write_scene(tmp_path / "scene.safetensors")
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Exit code, output and errors of ``advnerf scene ...``."""
+
+    def call(*words: object) -> tuple[object, str, str]:
+        monkeypatch.setenv("COLUMNS", "200")
+        code = advnerf(monkeypatch, "scene", *words)
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def stereo(scene: Path, file: Path) -> Path:
+    names = [f"{side}/{k}.png" for k in range(len(INSIDE)) for side in ("left", "right")]
+    right = [pose.copy() for pose in INSIDE]
+    for pose in right:
+        pose[:3, 3] += 0.02 * pose[:3, 0]
+    poses = [pose for pair in zip(INSIDE, right, strict=True) for pose in pair]
+    return write_frames(scene, file, poses, names=names)
+
+
+def test_both_images_of_a_stereo_camera_are_shown(scene: Path, tmp_path: Path) -> None:
+    view = SceneView(scene, stereo(scene, tmp_path / "transforms.json"), port=18090)
+    try:
+        assert len({frustum.name for frustum in view._frustums}) == 10
+    finally:
+        view.close()
+
+
+@pytest.mark.slow
+def test_files_of_a_training_name_both_images_of_a_stereo_camera(
+    scene: Path, tmp_path: Path, command: Command
+) -> None:
+    out = tmp_path / "learned"
+    images = stereo(scene, tmp_path / "transforms.json")
+    box = ("--box-low", -1, -1, -1, "--box-high", 1, 1, 1)
+    assert command("train", images, "-o", out, "--steps", 2, "--exposure", "--near", 0.05, *box)[0] == 0
+    gains, figures = (json.loads((out / name).read_text()) for name in ("exposure.json", "held_out.json"))
+    held_out = {row["image"] for row in figures["images"]}
+    # Sorted by the name alone, 0.png of either side comes first; every 8th is held out.
+    assert held_out == {"left/0.png", "left/4.png"}
+    assert {row["image"] for row in gains} | held_out == {
+        f"{side}/{k}.png" for k in range(5) for side in ("left", "right")
+    }
