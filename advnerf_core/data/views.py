@@ -6,8 +6,9 @@ and, where a set needs them, an opacity and a validity flag per pixel.
 
 from __future__ import annotations
 
+import filecmp
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,9 @@ from advnerf_core.geometry import Array, Pinhole
 # Instant-NGP maps the file's coordinates into its unit cube by 0.33 x + 0.5, unless the file says otherwise.
 NGP_SCALE, NGP_OFFSET = 0.33, (0.5, 0.5, 0.5)
 TRAIN, HELD_OUT_SPLITS = "train", ("val", "test")
+# Poses that are estimated for a file and for its copy differ so little, in parts of the cameras' spread and of the rotation.
+_ONE_POSE = 1e-3
+_MOST_COMPARED = 8  # of the images at one pose, with each: a car may have stood there for long
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +129,28 @@ class PosedImages:
                 "or move the camera instead of only turning it"
             )
 
+    def require_no_copies(self) -> None:
+        """Refuse a photograph that is in the set twice: held out as one, it is learned as the other.
+
+        Raises:
+            DatasetError: Two files at one pose have the same content.
+        """
+        for one, other in self._at_one_pose():
+            if filecmp.cmp(one.path, other.path, shallow=False):
+                raise DatasetError(
+                    f"expected each photograph once in {self._name}, as some are held out from learning, got {self.name_of(one)} again as "
+                    f"{self.name_of(other)}; take one of the two out of the file"
+                )
+
+    def _at_one_pose(self) -> Iterator[tuple[PosedImage, PosedImage]]:
+        poses = np.stack([frame.T_world_from_camera for frame in self.frames])
+        spread = float(np.ptp(poses[:, :3, 3], axis=0).max()) or 1.0
+        rows = np.concatenate([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3] / spread], axis=1)
+        for index, frame in enumerate(self.frames):
+            later = np.flatnonzero(np.abs(rows[index + 1 :] - rows[index]).max(axis=1) <= _ONE_POSE)
+            for other in later[:_MOST_COMPARED]:
+                yield frame, self.frames[index + 1 + other]
+
     @property
     def splits(self) -> tuple[str, ...]:
         """Splits defined by the data set itself, e.g. ``("train", "test")``; empty if it has none."""
@@ -156,21 +182,31 @@ class PosedImages:
         return self.with_frames([frame for frame in self.frames if frame.split in names])
 
     def split(self, every: int) -> tuple[PosedImages, PosedImages]:
-        """Training and held-out images: in the current order, every ``every``-th, from the first, is held out."""
+        """Training and held-out images: in the current order, every ``every``-th, from the first, is held out.
+
+        Raises:
+            DatasetError: Fewer than 2 images, or one that is there twice.
+        """
         if every < 2:
             raise ValueError(f"expected to hold out every 2nd image or fewer, got every {every}")
         if len(self.frames) < 2:
             raise DatasetError(
                 f"expected at least 2 images in {self._name} to hold some of them out, got {len(self.frames)}; take more photographs"
             )
+        self.require_no_copies()
         held = [f for i, f in enumerate(self.frames) if i % every == 0]
         rest = [f for i, f in enumerate(self.frames) if i % every != 0]
         return self.with_frames(rest), self.with_frames(held)
 
     def training_and_held_out(self, every: int = 8) -> tuple[PosedImages, PosedImages]:
-        """The data set's own split if it has one (all but ``train`` is held out), else every ``every``-th by name."""
+        """The data set's own split if it has one (all but ``train`` is held out), else every ``every``-th by name.
+
+        Raises:
+            DatasetError: Fewer than 2 images, or one that is there twice.
+        """
         training, held_out = self.of_split(TRAIN), self.of_split(*HELD_OUT_SPLITS)
         if training.frames and held_out.frames:
+            self.require_no_copies()
             return training, held_out
         return self.sorted_by_name().split(every)
 

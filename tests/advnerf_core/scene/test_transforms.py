@@ -36,10 +36,10 @@ def write(folder, frames=None, name="transforms.json", **content):
 
 
 def test_blender_folder_with_its_splits(tmp_path):
-    for split, count in (("train", 3), ("val", 1), ("test", 2)):
+    for value, (split, count) in enumerate((("train", 3), ("val", 1), ("test", 2))):
         frames = [{"file_path": f"./{split}/r_{k}", "transform_matrix": pose(k)} for k in range(count)]
         for k in range(count):
-            paint(tmp_path / split / f"r_{k}.png", channels=4)
+            paint(tmp_path / split / f"r_{k}.png", channels=4, value=value)
         (tmp_path / f"transforms_{split}.json").write_text(
             json.dumps({"camera_angle_x": 0.69, "frames": frames})
         )
@@ -62,6 +62,32 @@ def test_images_of_one_name_in_several_folders_have_names_of_their_own(tmp_path,
         listed = load_transforms(given)
         names = [listed.name_of(frame) for frame in listed.frames]
         assert names == ["left/0.png", "right/0.png", "../beside/0.png", "../far/0.png"]
+
+
+def test_a_photograph_and_its_copy_are_not_divided_into_learned_and_held_out(tmp_path):
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in range(9)]
+    # Pictures in the dark are all alike: only at one pose are they one photograph.
+    listed = load_transforms(write(tmp_path, frames))
+    assert len(listed.training_and_held_out()[1].frames) == 2
+    moved = np.array(pose(3))
+    moved[0, 3] += 0.002  # poses that were estimated for both, 8 m between the outer ones
+    copy = {"file_path": "copies/3 (1).png", "transform_matrix": moved.tolist()}
+    doubled = load_transforms(write(tmp_path, [*frames, copy]))
+    two = r"3\.png again as copies/3 \(1\)\.png|copies/3 \(1\)\.png again as 3\.png"
+    told = rf"each photograph once in .*got ({two}); take one of the two out"
+    for divide in (doubled.training_and_held_out, lambda: doubled.split(2)):
+        with pytest.raises(DatasetError, match=told):
+            divide()
+    paint(tmp_path / "copies" / "3 (1).png", value=91)
+    assert len(doubled.training_and_held_out()[1].frames) == 2, "another photograph from the same place"
+
+
+def test_a_copy_in_another_split_is_refused(tmp_path):
+    for split in ("train", "test"):
+        frames = [{"file_path": f"{split}/{k}.png", "transform_matrix": pose(k)} for k in range(2)]
+        write(tmp_path, frames, f"transforms_{split}.json")
+    with pytest.raises(DatasetError, match=r"got train/0\.png again as test/0\.png"):
+        load_transforms(tmp_path).training_and_held_out()
 
 
 def test_nerfstudio_lists_of_splits(tmp_path):

@@ -1,12 +1,14 @@
 """A place of photographs: its path, ground and camera are those of the car that took them."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import write_image
 from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.data.transforms import load_transforms
@@ -98,6 +100,33 @@ def test_content_and_not_the_folder_is_what_results_depend_on(tmp_path: Path) ->
     picture = tmp_path / "b" / "images_of_mine" / "images" / "00003.png"
     picture.write_bytes((picture.parent / "00009.png").read_bytes())
     assert place(tmp_path / "b").config.content_sha256 != first.content_sha256
+
+
+def test_copies_of_photographs_are_refused_before_halves_share_them(tmp_path: Path) -> None:
+    file = photographs(tmp_path / "images_of_mine", count=12) / "transforms.json"
+    content = json.loads(file.read_text())
+    shutil.copytree(file.parent / "images", file.parent / "copies")
+    copies = [
+        {**each, "file_path": each["file_path"].replace("images", "copies")} for each in content["frames"]
+    ]
+    listed_beside = file.with_name("transforms_car.json")
+    listed_beside.write_text(json.dumps({**content, "frames": copies}))
+    with pytest.raises(DatasetError, match=r"got images/\d+\.png again as copies/\d+\.png"):
+        place(tmp_path, path=str(listed_beside)).photographs(3)
+    file.write_text(json.dumps({**content, "frames": content["frames"] + copies}))
+    with pytest.raises(DatasetError, match=r"got images/\d+\.png again as copies/\d+\.png"):
+        place(tmp_path, half="even").photographs(3)
+
+
+def test_one_file_with_two_paths_is_not_learned_where_it_is_held_out(tmp_path: Path) -> None:
+    file = photographs(tmp_path / "images_of_mine", count=12) / "transforms.json"
+    content = json.loads(file.read_text())
+    for each in content["frames"]:
+        each["file_path"] = f"../images_of_mine/{each['file_path']}"
+    driven = file.with_name("transforms_car.json")
+    driven.write_text(json.dumps(content))
+    learned, held_out = place(tmp_path, path=str(driven)).photographs(3)
+    assert (len(learned), len(held_out)) == (9, 3)
 
 
 def test_a_view_of_the_driving_camera_is_cut_out_of_a_wider_photograph(tmp_path: Path) -> None:

@@ -154,7 +154,9 @@ class Photographs(Undriven):
 
         Raises:
             WorldError: Too few photographs.
+            DatasetError: One photograph is there twice.
         """
+        self._require_no_copies()
         along = [each for each in self.along if each.mask is None]
         if not 3 <= held_out <= len(along) // 3:
             masked = (
@@ -164,13 +166,18 @@ class Photographs(Undriven):
                 f"expected capture.held_out from 3 to a third of the {len(along)} photographs along the path, got {held_out}{masked}"
             )
         chosen = [along[index] for index in np.linspace(0, len(along) - 1, held_out + 2).astype(int)[1:-1]]
-        left_out = {each.path for each in chosen}
-        learned = [each for each in self._all if each.path not in left_out]
+        left_out = {each.path.resolve() for each in chosen}
+        learned = [each for each in self._all if each.path.resolve() not in left_out]
         if self.config.half is not None:
             learned = learned[self.config.half == "odd" :: 2]
         return [self._photograph(each, None) for each in learned], [
             self._photograph(each, self.camera_pinhole) for each in chosen
         ]
+
+    def _require_no_copies(self) -> None:
+        """Raise for a photograph with a copy: of a second list as well, and with another name for the same file counted once."""
+        once = {each.path.resolve(): each for each in (*self._all, *self._listed)}
+        read_images(self.config.images).with_frames(list(once.values())).require_no_copies()
 
     @property
     def along(self) -> Sequence[PosedImage]:
