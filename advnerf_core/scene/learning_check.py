@@ -12,7 +12,7 @@ AFTER_STEPS = 100
 # Pictures with the inverses of their poses are learned one by one: held-out ones stay near one colour.
 _BETTER_DB, _HELD_OUT_BETTER_DB = 1.0, 3.0
 _CAUSES = "the box, --near, and the poses (axes, unit, from camera to world and not the inverse, one line for each image)"
-# Pictures that are nearly of one colour are no test.
+# Pictures that are nearly of one colour are no test of a training.
 _PLAIN_DB = 35.0
 _MOST_PIXELS = 1 << 20
 
@@ -22,7 +22,7 @@ class LearningCheck:
 
     def __init__(self, images: ImageSet) -> None:
         self._one_colour_db = one_colour_db(images)
-        self._done = _says_nothing(images, self._one_colour_db)
+        self._done = images.alpha is not None or self._one_colour_db > _PLAIN_DB
 
     def __call__(self, at: TrainingReport) -> str | None:
         """A sentence about the problem, at the first report after 100 steps; None if there is no problem."""
@@ -38,24 +38,19 @@ class LearningCheck:
 
 
 def held_out_problem(psnr_db: float, images: ImageSet) -> str | None:
-    """A sentence if a finished scene shows held-out pictures hardly better than one colour; None otherwise.
+    """A sentence if a finished scene shows held-out pictures hardly better than one colour; None otherwise, and for pictures with alpha.
 
     Args:
         psnr_db: Mean PSNR of the pictures [dB].
         images: The pictures.
     """
     plain_db = one_colour_db(images)
-    if _says_nothing(images, plain_db) or psnr_db > plain_db + _HELD_OUT_BETTER_DB:
+    if images.alpha is not None or psnr_db > plain_db + _HELD_OUT_BETTER_DB:
         return None
-    return (
-        f"held-out pictures reach {psnr_db:.1f} dB, one colour for all gives {plain_db:.1f} dB: the scene is no copy of the place; train longer, or "
-        f"check {_CAUSES}"
-    )
-
-
-def _says_nothing(images: ImageSet, plain_db: float) -> bool:
-    """Whether a comparison with one colour is no test."""
-    return images.alpha is not None or plain_db > _PLAIN_DB
+    reached = f"held-out pictures reach {psnr_db:.1f} dB, one colour for all gives {plain_db:.1f} dB"
+    if plain_db > _PLAIN_DB:
+        return f"{reached}: they are nearly of one colour, and this PSNR says nothing; take brighter pictures, or such that show more"
+    return f"{reached}: the scene is no copy of the place; train longer, or check {_CAUSES}"
 
 
 def one_colour_db(images: ImageSet) -> float:

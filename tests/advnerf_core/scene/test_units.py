@@ -124,6 +124,16 @@ def test_what_one_colour_reaches_follows_from_the_spread_of_colours():
     assert LearningCheck(images)(dataclasses.replace(at, psnr_db=9.0)) is None
 
 
+def test_a_psnr_of_pictures_in_the_dark_says_nothing():
+    rgb = np.zeros((1, 10, 10, 3), np.uint8)
+    rgb[:, :5] = 2
+    images = ImageSet(rgb, (LENS,), np.eye(4)[None])
+    plain_db = -20 * np.log10(1 / 255)  # each pixel is one level off their mean
+    problem = held_out_problem(43.8, images)
+    assert f"43.8 dB, one colour for all gives {plain_db:.1f} dB: they are nearly of one colour" in problem
+    assert held_out_problem(plain_db + 4.0, images) is None
+
+
 @pytest.mark.parametrize(
     ("offset", "spread", "good"),
     [(0.0, 1.0, True), (5e3, 1.0, True), (5e3, 0.005, False), (5e6, 1000.0, True), (6e5, 1.0, False)],
