@@ -89,11 +89,14 @@ def scene_eval(
     """Evaluate a scene on the held-out images of a data set."""
     from advnerf_core.data.transforms import load_transforms
     from advnerf_core.splats.scene_file import load_renderer
-    from nodes.lab.scene_training import evaluate
+    from nodes.lab.scene_training import evaluate, warn_of
 
     renderer = load_renderer(scene, interval_scale)
     held_out = load_transforms(transforms).training_and_held_out(every)[1]
-    _print_figures(evaluate(renderer, held_out, held_out.load(size)))
+    views = held_out.load(size)
+    figures = evaluate(renderer, held_out, views)
+    warn_of(figures, views)
+    _print_figures(figures)
 
 
 @app.command("render")
@@ -158,6 +161,8 @@ def scene_view(
 def _print_figures(figures: dict[str, Any]) -> None:
     rows = table("held-out image", "PSNR", "PSNR, gain fitted", "SSIM")
     for row in [*figures["images"], {"image": "mean", **figures["mean"]}]:
-        plain, fitted = (f"{row[key]:.2f} dB" for key in ("psnr_db", "gain_fitted_psnr_db"))
+        plain, fitted = (
+            "-" if row[key] is None else f"{row[key]:.2f} dB" for key in ("psnr_db", "gain_fitted_psnr_db")
+        )
         rows.add_row(row["image"], plain, fitted, f"{row['ssim']:.3f}")
     print_table(rows)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from advnerf_core.data.image_files import OPAQUE
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import ImageSet, PosedImages
 from advnerf_core.fields.hash_grid import HashGridConfig
-from advnerf_core.files import write_atomically, write_json
+from advnerf_core.files import finite_or_none, write_atomically, write_json
 from advnerf_core.geometry import Array
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.report.clips import write_video
@@ -41,6 +43,7 @@ SCENE, CHECKPOINT, FIGURES, EXPOSURE = (
 MM_PER_M = 1000.0
 _NO_TIME_LIMIT_STEPS = 1_000_000
 _WHITE = (1.0, 1.0, 1.0)
+_BLACK = 4  # of 255: noise of sensors and JPEG in a picture without light
 _MEASURES = ("psnr_db", "gain_fitted_psnr_db", "ssim")
 
 
@@ -84,8 +87,7 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
         write_json(request.output / EXPOSURE, rows)
     figures = evaluate(FieldRenderer.from_file(request.output / SCENE), held_out, compared)
     write_json(request.output / FIGURES, figures)
-    if (told := held_out_problem(figures["mean"]["psnr_db"], compared)) is not None:
-        print(f"warning: {told}", flush=True)
+    warn_of(figures, compared)
     return figures
 
 
@@ -97,19 +99,36 @@ def evaluate(renderer: FieldRenderer | SplatRenderer, listed: PosedImages, views
         listed: The images' list, for their names.
         views: The same images, loaded.
 
-    Masked pixels are excluded from both PSNR.
+    Masked pixels are excluded from both PSNR. None where there is no number, as of a gain for a black picture; means are of the others.
     """
     # Images with alpha are compared over white, which the renderer uses too.
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"image": listed.name_of(listed.frames[index]), **_compared(renderer, views, index, real)}
         for index, real in enumerate(views.on_background(_WHITE))
     ]
-    return {"mean": {key: float(np.mean([row[key] for row in rows])) for key in _MEASURES}, "images": rows}
+    return {"mean": {key: _mean_of([row[key] for row in rows]) for key in _MEASURES}, "images": rows}
+
+
+def _mean_of(values: Sequence[float | None]) -> float | None:
+    numbers = [value for value in values if value is not None]
+    return float(np.mean(numbers)) if numbers else None
+
+
+def warn_of(figures: dict[str, Any], views: ImageSet) -> None:
+    """Print why the figures of `evaluate` say little of the scene, if they do: its pictures are black, or it is no copy of the place."""
+    if black := [row["image"] for row in figures["images"] if row["gain_fitted_psnr_db"] is None]:
+        print(
+            f"warning: no gain can be fitted to black or empty pictures: {', '.join(black)}; take them out",
+            flush=True,
+        )
+    mean_db = figures["mean"]["psnr_db"]
+    if mean_db is not None and (told := held_out_problem(mean_db, views)) is not None:
+        print(f"warning: {told}", flush=True)
 
 
 def _compared(
     renderer: FieldRenderer | SplatRenderer, views: ImageSet, index: int, real: NDArray[np.uint8]
-) -> dict[str, float]:
+) -> dict[str, float | None]:
     rgb, _, alpha = (
         each[0].numpy()
         for each in renderer.render(views.T_world_from_camera[index][None], views.pinholes[index])
@@ -117,8 +136,11 @@ def _compared(
     usable = np.ones(real.shape[:2], dtype=bool) if views.valid is None else views.valid[index]
     white = 0.0 if renderer.config.learned_background else 1.0 - alpha[usable][:, None]
     ours, theirs = rgb[usable], real[usable] / 255.0
-    fitted_db = psnr(gain_fitted(ours, theirs, white), theirs)
-    return dict(zip(_MEASURES, (psnr(ours, theirs), fitted_db, ssim(rgb, real / 255.0)), strict=True))
+    # A gain of nearly 0 makes any picture black.
+    black = not (real[usable] > _BLACK).any()
+    fitted_db = math.inf if black else psnr(gain_fitted(ours, theirs, white), theirs)
+    found = psnr(ours, theirs), fitted_db, ssim(rgb, real / 255.0)
+    return {key: finite_or_none(value) for key, value in zip(_MEASURES, found, strict=True)}
 
 
 def render(

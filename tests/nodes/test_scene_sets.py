@@ -4,13 +4,19 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from advnerf_core.data.transforms import load_transforms
+from advnerf_core.scene.render_field import FieldRenderer
+from nodes.lab.scene_training import evaluate
 from nodes.lab.scene_view import SceneView
 from tests.support.commands import advnerf
 from tests.support.opaque_scene import INSIDE, write_frames, write_scene
 
 Command = Callable[..., tuple[object, str, str]]
+TURNED = np.diag([-1.0, 1.0, -1.0, 1.0])  # half a turn about the vertical
 
 
 @pytest.fixture
@@ -62,3 +68,18 @@ def test_files_of_a_training_name_both_images_of_a_stereo_camera(
     assert {row["image"] for row in gains} | held_out == {
         f"{side}/{k}.png" for k in range(5) for side in ("left", "right")
     }
+
+
+def test_a_black_picture_is_named_and_has_no_gain(scene: Path, tmp_path: Path, command: Command) -> None:
+    file = write_frames(scene, tmp_path / "transforms.json", [*INSIDE, INSIDE[0] @ TURNED])
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((30, 40, 3), 3, np.uint8))
+    code, output, _ = command("eval", scene, file, "--every", 3)
+    assert code == 0
+    assert "no gain can be fitted to black or empty pictures: 0.png; take them out" in output
+    rows = {line.split()[0]: line for line in output.splitlines() if "dB" in line}
+    assert rows["0.png"].split()[3] == "-"
+    assert rows["mean"].split()[3] == rows["3.png"].split()[3], "of the other picture"
+    listed = load_transforms(file).training_and_held_out(3)[1]
+    figures = evaluate(FieldRenderer.from_file(scene), listed, listed.load())
+    assert figures["images"][0]["gain_fitted_psnr_db"] is None
+    json.dumps(figures, allow_nan=False)
