@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from advnerf_core.data.image_files import OPAQUE
 from advnerf_core.data.views import ImageSet
@@ -21,7 +22,7 @@ class LearningCheck:
     """Reports once if a training does not learn."""
 
     def __init__(self, images: ImageSet) -> None:
-        self._one_colour_db = one_colour_db(images)
+        self._one_colour_db = one_colour_db(images.rgb)
         self._done = images.alpha is not None or self._one_colour_db > _PLAIN_DB
 
     def __call__(self, at: TrainingReport) -> str | None:
@@ -44,17 +45,22 @@ def held_out_problem(psnr_db: float, images: ImageSet) -> str | None:
         psnr_db: Mean PSNR of the pictures [dB].
         images: The pictures.
     """
-    plain_db = one_colour_db(images)
-    if images.alpha is not None or psnr_db > plain_db + _HELD_OUT_BETTER_DB:
+    if images.alpha is not None or beats_one_colour(psnr_db, images.rgb):
         return None
+    plain_db = one_colour_db(images.rgb)
     reached = f"held-out pictures reach {psnr_db:.1f} dB, one colour for all gives {plain_db:.1f} dB"
     if plain_db > _PLAIN_DB:
         return f"{reached}: they are nearly of one colour, and this PSNR says nothing; take brighter pictures, or such that show more"
     return f"{reached}: the scene is no copy of the place; train longer, or check {_CAUSES}"
 
 
-def one_colour_db(images: ImageSet) -> float:
-    """PSNR of all pixels against their mean colour [dB], which a scene without content reaches."""
-    step = max(1, images.rgb[..., 0].size // _MOST_PIXELS)
-    pixels = images.rgb.reshape(-1, 3)[::step].astype(np.float64) / OPAQUE
+def beats_one_colour(psnr_db: float, rgb: NDArray[np.uint8]) -> bool:
+    """Whether a PSNR of pixels ``[..., 3]`` [dB] is clearly above that of one colour for all of them."""
+    return psnr_db > one_colour_db(rgb) + _HELD_OUT_BETTER_DB
+
+
+def one_colour_db(rgb: NDArray[np.uint8]) -> float:
+    """PSNR of all pixels ``[..., 3]`` against their mean colour [dB], which a scene without content reaches."""
+    step = max(1, rgb[..., 0].size // _MOST_PIXELS)
+    pixels = rgb.reshape(-1, 3)[::step].astype(np.float64) / OPAQUE
     return float(-10.0 * np.log10(max(pixels.var(axis=0).mean(), 1e-12)))

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.video import thinned
-from advnerf_core.data.views import ImageSet
+from advnerf_core.data.view_loading import load_image
 from advnerf_core.files import refuse_overwriting
 from advnerf_core.scene.colour import IDENTITY, ColourMap, fit_colour_map
 from advnerf_core.scene.field import load_scene, save_scene
+from advnerf_core.scene.learning_check import beats_one_colour, one_colour_db
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.splats.scene_file import is_splat_scene
@@ -49,7 +52,7 @@ def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourM
         most: Largest number of frames, evenly spread.
 
     Raises:
-        ImportRecordingError: The frames do not show the scene.
+        ImportRecordingError: The frames do not show the scene. Nothing is written.
         PlaceError: The output is a file of the images.
     """
     listed = load_transforms(images)
@@ -58,32 +61,39 @@ def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourM
         raise ImportRecordingError(
             f"expected a scene that was learned, got the splat {scene}, which has no colour map; train one with advnerf scene train"
         )
-    frames = listed.with_frames(thinned(list(listed.frames), most)).load()
+    frames = thinned(list(listed.frames), most)
     field, occupied, metadata = load_scene(scene)
     # Do not apply the map of an earlier fit.
-    learned = seen_colours(FieldRenderer.from_file(scene, IDENTITY), frames)
+    learned, rgb = seen_colours(FieldRenderer.from_file(scene, IDENTITY), frames)
     inside = np.isfinite(learned).all(axis=-1)
     if inside.mean() < _LEAST_SEEN:
         raise ImportRecordingError(
             f"expected frames that look into the scene of {scene}, got {100 * inside.mean():.1f} % of their pixels inside it; "
             "make both in one world with advnerf scene from-phone-and-car"
         )
-    found = fit_colour_map(learned[inside], frames.rgb[inside])
-    real = frames.rgb[inside] / np.float32(255.0)
-    match = ColourMatch(
-        found, len(frames.rgb), psnr(learned[inside], real), psnr(found.apply(learned[inside]), real)
-    )
+    learned, rgb = learned[inside], rgb[inside]
+    found = fit_colour_map(learned, rgb)
+    match = ColourMatch(found, len(frames), psnr(learned, rgb), psnr(found.apply(learned), rgb))
+    if not beats_one_colour(match.after_db, rgb):
+        raise ImportRecordingError(
+            f"expected frames of what {scene} shows, from the same places, got a PSNR of {match.after_db:.1f} dB with the best colour map, where "
+            f"one colour for all gives {one_colour_db(rgb):.1f} dB; make both in one world with advnerf scene from-phone-and-car"
+        )
     kept = {key: value for key, value in metadata.items() if key != "scene_hash"}
     save_scene(output, field, occupied, {**kept, "colour_map": found.to_dict()})
     return match
 
 
-def seen_colours(renderer: FieldRenderer, views: ImageSet) -> NDArray[np.float32]:
-    """Render the colours of every view ``[N, H, W, 3]`` in 0..1; NaN where the scene is transparent."""
-    images = []
-    for pose, pinhole in zip(views.T_world_from_camera, views.pinholes, strict=True):
-        rgb, _, alpha = renderer.render(pose[None], pinhole)
+def seen_colours(
+    renderer: FieldRenderer, frames: Sequence[PosedImage]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """The colours of all pixels of frames, of any sizes: rendered ``[N, 3]`` in 0..1, NaN where the scene is transparent, and taken ``[N, 3]``."""
+    rendered, taken = [], []
+    for frame in frames:
+        real, pinhole = load_image(frame)
+        rgb, _, alpha = renderer.render(frame.T_world_from_camera[None], pinhole)
         image = rgb[0].numpy().copy()
         image[alpha[0].numpy() < _LEAST_ALPHA] = np.nan
-        images.append(image)
-    return np.stack(images)
+        rendered.append(image.reshape(-1, 3))
+        taken.append(real.reshape(-1, 3))
+    return np.concatenate(rendered), np.concatenate(taken)

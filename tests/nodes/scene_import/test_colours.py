@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from advnerf_core.data.transforms_write import write_transforms
 from advnerf_core.geometry import look_at
 from advnerf_core.scene.colour import IDENTITY, ColourMap
 from advnerf_core.scene.field import load_scene
@@ -49,6 +50,27 @@ def test_frames_that_look_past_the_scene_are_refused(tmp_path, scene):
     images = frames_of(scene, tmp_path, [look_at([5.0, 5.0 + k, 0.0], [9.0, 9.0, 0.0]) for k in range(2)])
     with pytest.raises(ImportRecordingError, match=r"look into the scene of .*got 0\.0 % of their pixels"):
         match_colours(scene, images, scene, 4)
+
+
+def test_frames_of_another_world_get_no_map(tmp_path, scene):
+    images = frames_of(scene, tmp_path, INSIDE)
+    elsewhere = [look_at([0.7 - 0.1 * k, -0.6, 0.5], [-1.0, 1.0, 0.2 * k]) for k in range(5)]
+    write_transforms(images, [f"{k}.png" for k in range(5)], np.stack(elsewhere), CAMERA)
+    output = tmp_path / "mapped.safetensors"
+    told = (
+        r"expected frames of what .*scene\.safetensors shows, from the same places, got a PSNR of \d+\.\d dB"
+    )
+    with pytest.raises(ImportRecordingError, match=told):
+        match_colours(scene, images, output, 4)
+    assert not output.exists()
+
+
+def test_frames_may_differ_in_size(tmp_path, scene):
+    cameras = [CAMERA, CAMERA.resized(80, 60), CAMERA]
+    images = write_frames(scene, tmp_path / "transforms_car.json", INSIDE[:3], TRUE, cameras)
+    match = match_colours(scene, images, scene, 4)
+    assert match.frames == 3
+    assert match.after_db > 50.0
 
 
 def test_a_splat_has_no_colour_map(tmp_path, scene):
