@@ -247,6 +247,20 @@ class PosedImages:
             tuple(frame.camera_id for frame in self.frames),
         )
 
+    def pinholes(self, size: tuple[int, int] | None = None) -> list[Pinhole]:
+        """Intrinsics of all images, undistorted and resized as by `load`; their sizes may differ.
+
+        Args:
+            size: ``(width, height)`` [px] that all images are resized to; None keeps the size on disk.
+
+        Raises:
+            DatasetError: An image or the size cannot be used.
+        """
+        if size is not None:
+            require_size(*size)
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            return list(pool.map(lambda frame: load_view(frame, size).pinhole, self.frames))
+
     def box(self) -> tuple[Array, Array]:
         """Low and high corner ``[3]`` of Instant-NGP's box for this file, in its world units."""
         half = 0.5 * (self.aabb_scale or 1.0) / self.scale

@@ -43,6 +43,7 @@ SCENE, CHECKPOINT, FIGURES, EXPOSURE = (
 MM_PER_M = 1000.0
 _NO_TIME_LIMIT_STEPS = 1_000_000
 _WHITE = (1.0, 1.0, 1.0)
+_NAMED = 3  # cameras in a warning
 _BLACK = 4  # of 255: noise of sensors and JPEG in a picture without light
 _MEASURES = ("psnr_db", "gain_fitted_psnr_db", "ssim")
 
@@ -157,11 +158,20 @@ def render(
 
     Returns:
         The number of views.
+
+    Raises:
+        ConfigError: The video would have pictures of several sizes.
     """
-    loaded, views = listed.load(size), rendered_files(listed, output)
+    pinholes, views = listed.pinholes(size), rendered_files(listed, output)
+    sizes = sorted({(pinhole.width, pinhole.height) for pinhole in pinholes})
+    if video is not None and len(sizes) > 1:
+        raise ConfigError(
+            f"expected cameras of one size for a video, got {sizes}; give --size WIDTH HEIGHT, or leave --video out"
+        )
+    _warn_of_cameras_outside(renderer, listed)
     frames: list[NDArray[np.uint8]] = []
-    for index, (pose, pinhole) in enumerate(zip(loaded.T_world_from_camera, loaded.pinholes, strict=True)):
-        rgb, depth_m, alpha = renderer.render(pose[None], pinhole)
+    for index, (camera, pinhole) in enumerate(zip(listed.frames, pinholes, strict=True)):
+        rgb, depth_m, alpha = renderer.render(camera.T_world_from_camera[None], pinhole)
         picture = np.rint(255 * rgb[0].numpy()).astype(np.uint8)
         file = views[index]
         if renderer.config.learned_background:
@@ -170,10 +180,26 @@ def render(
             _write_png(file, _with_alpha(rgb[0].numpy(), alpha[0].numpy()))
         _write_png(file.with_name(f"{file.stem}_depth_mm.png"), depth_in_mm(depth_m[0].numpy()))
         frames.append(picture)
-        report((index + 1) / len(loaded.rgb), file.stem)
+        report((index + 1) / len(pinholes), file.stem)
     if video is not None:
         write_video(video, frames)
     return len(frames)
+
+
+def _warn_of_cameras_outside(renderer: FieldRenderer | SplatRenderer, listed: PosedImages) -> None:
+    """Print which cameras are not in the box of a scene that is a place; objects, which have alpha, are looked at from outside."""
+    config = renderer.config
+    low, high = np.array(config.box_low_m), np.array(config.box_high_m)
+    places = np.stack([frame.T_world_from_camera[:3, 3] for frame in listed.frames])
+    outside = np.flatnonzero(((places < low) | (places > high)).any(axis=1))
+    if not config.learned_background or not outside.size:
+        return
+    names = ", ".join(listed.name_of(listed.frames[index]) for index in outside[:_NAMED])
+    print(
+        f"warning: {outside.size} of {len(places)} cameras are outside the box of the scene, {_short(low)} .. {_short(high)}: {names}"
+        f"{', ...' if outside.size > _NAMED else ''}; if they should be inside, check the unit and the axes of their poses",
+        flush=True,
+    )
 
 
 def depth_in_mm(depth_m: Array) -> NDArray[np.uint16]:

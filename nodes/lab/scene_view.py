@@ -7,9 +7,11 @@ sent too, so that walls hide what viser draws (cameras, path).
 from __future__ import annotations
 
 import functools
+import os
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +21,11 @@ import torch
 import viser
 from numpy.typing import NDArray
 
+from advnerf_core.data.image_files import Rgb
+from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.data.transforms import load_transforms
-from advnerf_core.data.views import ImageSet
+from advnerf_core.data.view_loading import load_image
+from advnerf_core.data.views import PosedImages
 from advnerf_core.geometry import (
     Array,
     Pinhole,
@@ -72,7 +77,7 @@ class SceneView:
         self._show_cameras = self._server.gui.add_checkbox("cameras", views is not None)
         self._frustums: list[Any] = []
         if views is not None:
-            self._add_cameras(views.load(), [views.name_of(frame) for frame in views.frames])
+            self._add_cameras(views)
         if room is not None:
             self._add_path(load_calibration(RoomCalibration, room))
         self._mode.on_update(lambda event: self._refresh())
@@ -145,13 +150,14 @@ class SceneView:
         for frustum in self._frustums:
             frustum.visible = bool(self._show_cameras.value)
 
-    def _add_cameras(self, views: ImageSet, names: Sequence[str]) -> None:
-        every = max(1, -(-len(views.rgb) // _MOST_CAMERAS))
-        for k in range(0, len(views.rgb), every):
-            lens, T = views.pinholes[k], views.T_world_from_camera[k]
-            small = cv2.resize(views.rgb[k], (_THUMBNAIL_PX, _THUMBNAIL_PX * lens.height // lens.width))
+    def _add_cameras(self, views: PosedImages) -> None:
+        shown = views.frames[:: max(1, -(-len(views.frames) // _MOST_CAMERAS))]
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            thumbnails = list(pool.map(_thumbnail, shown))
+        for frame, (small, lens) in zip(shown, thumbnails, strict=True):
+            T = frame.T_world_from_camera
             frustum = self._server.scene.add_camera_frustum(
-                f"/cameras/{names[k]}",
+                f"/cameras/{views.name_of(frame)}",
                 2 * float(np.arctan(0.5 * lens.height / lens.fy)),
                 lens.width / lens.height,
                 scale=0.02 * self._renderer.config.extent_m,
@@ -208,6 +214,12 @@ class _Viewer:
             T, Pinhole(width, height, f, f, 0.5 * width, 0.5 * height), self._view.mode
         )
         self._client.scene.set_background_image(picture, depth=depth.astype(np.float32))
+
+
+def _thumbnail(frame: PosedImage) -> tuple[Rgb, Pinhole]:
+    rgb, lens = load_image(frame)
+    size = _THUMBNAIL_PX, max(1, _THUMBNAIL_PX * lens.height // lens.width)
+    return np.asarray(cv2.resize(rgb, size), np.uint8), lens
 
 
 def _stand_at(T: Array, event: Any) -> None:

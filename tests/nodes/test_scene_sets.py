@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from advnerf_core.data.transforms import load_transforms
+from advnerf_core.geometry import Pinhole
 from advnerf_core.scene.render_field import FieldRenderer
 from nodes.lab.scene_training import evaluate
 from nodes.lab.scene_view import SceneView
 from tests.support.commands import advnerf
-from tests.support.opaque_scene import INSIDE, write_frames, write_scene
+from tests.support.opaque_scene import CAMERA, INSIDE, write_frames, write_scene
 
 Command = Callable[..., tuple[object, str, str]]
 TURNED = np.diag([-1.0, 1.0, -1.0, 1.0])  # half a turn about the vertical
@@ -83,3 +84,48 @@ def test_a_black_picture_is_named_and_has_no_gain(scene: Path, tmp_path: Path, c
     figures = evaluate(FieldRenderer.from_file(scene), listed, listed.load())
     assert figures["images"][0]["gain_fitted_psnr_db"] is None
     json.dumps(figures, allow_nan=False)
+
+
+@pytest.fixture
+def mixed(scene: Path, tmp_path: Path) -> Path:
+    """Photographs of two sizes, the second through a lens of its own."""
+    cameras = [CAMERA, Pinhole(80, 40, 50.0, 50.0, 40.0, 20.0), CAMERA]
+    return write_frames(scene, tmp_path / "transforms.json", INSIDE[:3], cameras=cameras)
+
+
+def test_photographs_of_several_sizes_are_rendered_each_in_its_own(
+    scene: Path, mixed: Path, tmp_path: Path, command: Command
+) -> None:
+    assert command("render", scene, mixed, "-o", tmp_path / "views")[0] == 0
+    for k in range(3):
+        ours, real = (cv2.imread(str(tmp_path / f)) for f in (f"views/{k:04d}_{k}.png", f"{k}.png"))
+        assert ours.shape == real.shape
+        assert np.abs(ours.astype(int) - real).max() <= 1
+    film = ("render", scene, mixed, "-o", tmp_path / "film", "--video", tmp_path / "film.mp4")
+    code, _, errors = command(*film)
+    assert code == 2
+    assert "cameras of one size for a video, got [(40, 30), (80, 40)]; give --size WIDTH HEIGHT" in errors
+    assert not (tmp_path / "film").exists()
+    assert command(*film, "--size", 40, 30)[0] == 0
+
+
+def test_photographs_of_several_sizes_are_shown_each_in_its_own(scene: Path, mixed: Path) -> None:
+    view = SceneView(scene, mixed, port=18092)
+    try:
+        assert [frustum.aspect for frustum in view._frustums] == pytest.approx([4 / 3, 2.0, 4 / 3])
+    finally:
+        view.close()
+
+
+def test_cameras_outside_the_scene_are_named(scene: Path, tmp_path: Path, command: Command) -> None:
+    poses = [pose.copy() for pose in INSIDE]
+    poses[3][:3, 3] *= 1000.0  # in millimetres
+    file = write_frames(scene, tmp_path / "transforms.json", poses)
+    code, output, _ = command("render", scene, file, "-o", tmp_path / "views")
+    assert code == 0
+    assert (
+        "1 of 5 cameras are outside the box of the scene, [-1.0, -1.0, -1.0] .. [1.0, 1.0, 1.0]: 3.png; if"
+        in output
+    )
+    inside = write_frames(scene, tmp_path / "inside.json", INSIDE)
+    assert "warning" not in command("render", scene, inside, "-o", tmp_path / "views")[1]
