@@ -34,6 +34,7 @@ from advnerf_core.geometry import (
     rotation_from_quaternion,
 )
 from advnerf_core.objects.voxel.model import load_object
+from advnerf_core.render.cast_object import ObjectCast, cast_work, made_opaque
 from advnerf_core.scene.surrogate import Surrogate
 from advnerf_core.splats.scene_file import load_renderer
 from calibration.schema import RoomCalibration, load_calibration
@@ -113,12 +114,11 @@ class SceneView:
         with self._lock, torch.no_grad():
             rgb, depth_m, _ = self._renderer.render(T_world_from_camera[None], pinhole)
             image, depth = rgb[0].numpy(), np.nan_to_num(depth_m[0].numpy().astype(np.float64), posinf=_FAR_M)
-            if self._objects and mode == "colour":
-                surrogate = Surrogate(
-                    lambda poses, lens: (rgb, depth_m), pinhole, np.eye(4), self._objects, supersample=1
-                )
-                drawn = surrogate.render(T_world_from_camera[None], surrogate.plain_theta()).images
-                image = drawn[0].permute(1, 2, 0).numpy()
+            if self._objects:
+                surrogate = Surrogate(self._renderer.render, pinhole, np.eye(4), self._objects, supersample=1)
+                casts = cast_work(self._objects, T_world_from_camera, pinhole, supersample=1).run()
+                drawn = surrogate.composed(casts, rgb, depth_m).render(surrogate.plain_theta()).images
+                image, depth = drawn[0].permute(1, 2, 0).numpy(), _nearest(depth, casts)
             self.rendered += 1
         if mode == "depth":
             return _coloured(depth), depth
@@ -220,6 +220,14 @@ def _thumbnail(frame: PosedImage) -> tuple[Rgb, Pinhole]:
     rgb, lens = load_image(frame)
     size = _THUMBNAIL_PX, max(1, _THUMBNAIL_PX * lens.height // lens.width)
     return np.asarray(cv2.resize(rgb, size), np.uint8), lens
+
+
+def _nearest(depth_m: Array, casts: Sequence[ObjectCast]) -> Array:
+    """Depth ``[H, W]`` [m] of the scene, or of objects that are in front of it and cover at least half of the pixel."""
+    nearest = depth_m.copy()
+    for cast in map(made_opaque, casts):
+        nearest.flat[cast.pixels] = np.minimum(nearest.flat[cast.pixels], cast.depth_m)
+    return nearest
 
 
 def _stand_at(T: Array, event: Any) -> None:

@@ -7,9 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from advnerf_core.data.transforms import load_transforms
-from advnerf_core.geometry import Pinhole
+from advnerf_core.geometry import Pinhole, look_at
+from advnerf_core.objects.voxel.mesh import SurfaceMesh, part_from_colours
+from advnerf_core.objects.voxel.model import ObjectModel, save_object
+from advnerf_core.objects.voxel.voxelise import voxelise
 from advnerf_core.scene.render_field import FieldRenderer
 from nodes.lab.scene_training import evaluate
 from nodes.lab.scene_view import SceneView
@@ -129,3 +133,30 @@ def test_cameras_outside_the_scene_are_named(scene: Path, tmp_path: Path, comman
     )
     inside = write_frames(scene, tmp_path / "inside.json", INSIDE)
     assert "warning" not in command("render", scene, inside, "-o", tmp_path / "views")[1]
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_the_depth_that_is_sent_and_shown_has_the_objects_in_it(tmp_path: Path, full: bool) -> None:
+    """Seen along y from 0.9 m, a box of 0.4 m is 0.7 m away and 0.4 / 0.7 of the focal length wide; or matter hides it."""
+    box = trimesh.creation.box((0.4, 0.4, 0.4))
+    mesh = SurfaceMesh((part_from_colours(box.triangles, np.full((12, 3), 0.5)),))
+    save_object(tmp_path / "box.object.safetensors", ObjectModel("box", voxelise(mesh, 32)))
+    scene = write_scene(tmp_path / "scene.safetensors", full)
+    pose, lens = look_at([0.0, -0.9, 0.0], [0.0, 0.0, 0.0]), Pinhole(70, 70, 70.0, 70.0, 35.0, 35.0)
+    view, bare = (
+        SceneView(scene, objects=objects, port=18094)
+        for objects in ([tmp_path / "box.object.safetensors"], [])
+    )
+    try:
+        depth_m, without_m = (each.picture(pose, lens)[1] for each in (view, bare))
+        shown, plain = (each.picture(pose, lens, "depth")[0] for each in (view, bare))
+    finally:
+        view.close()
+        bare.close()
+    changed = depth_m != without_m
+    assert (shown == plain).all() == full
+    if full:
+        assert not changed.any()
+    else:
+        assert depth_m[changed] == pytest.approx(0.7, abs=0.02)
+        assert changed.sum() == pytest.approx(40**2, rel=0.1)

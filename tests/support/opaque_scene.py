@@ -18,15 +18,15 @@ CAMERA = Pinhole(40, 30, 30.0, 30.0, 20.0, 15.0)
 INSIDE = [look_at([0.3 * np.cos(a), 0.3 * np.sin(a), 0.1], [0.0, 0.0, 0.0]) for a in np.linspace(0.0, 5.0, 5)]
 
 
-def write_scene(path: Path) -> Path:
-    """A box of 2 m, full of matter."""
+def write_scene(path: Path, full: bool = True) -> Path:
+    """A box of 2 m, full of matter or empty."""
     grid = HashGridConfig(levels=4, features=2, log2_entries=10, coarsest=4, finest=16)
     field = SceneField(SceneFieldConfig((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), grid=grid, hidden=8, features=7))
     with torch.no_grad():
         field.grid.table.normal_(std=0.8, generator=torch.Generator().manual_seed(0))
         field.density_2.bias[0] = 6.0
         field.colour_2.weight.normal_(std=1.5, generator=torch.Generator().manual_seed(1))
-    save_scene(path, field, np.ones((16, 16, 16), np.bool_), {"steps": 3})
+    save_scene(path, field, np.full((16, 16, 16), full), {"steps": 3})
     return path
 
 
