@@ -85,17 +85,23 @@ def read_steps_back(bag: Path) -> tuple[str, ...]:
 def require_order(bag: Path, topic: str, numbers: Sequence[int]) -> None:
     """Refuse a topic whose messages lie in another order than they were published in: the recorder's clock was set back while it ran.
 
+    Numbers also go back where the publisher was restarted, which is only said: its messages are in order.
+
     Args:
         numbers: The messages' numbers from their publisher, in the order of the bag.
 
     Raises:
-        BagError: Their numbers go back more often than a publisher that was restarted once explains.
+        BagError: Their numbers go back more than once, and log times go back as they were written.
     """
-    if (back := sum(after < before for before, after in pairwise(numbers))) > 1:
+    if (back := sum(after < before for before, after in pairwise(numbers))) < 2:
+        return
+    written_ns = (log_ns for name, log_ns in read_times_as_written(bag) if name == topic)
+    if any(after < before for before, after in pairwise(written_ns)):
         raise BagError(
             f"expected the messages of {topic} in {bag} in the order of their publication, got {back} that go back: the recorder's clock was set back "
             "while it ran, so that two stretches of time are mixed; record the drive again"
         )
+    _say(bag, (f"the publisher of {topic} was restarted {back} times while the bag was recorded",))
 
 
 def skipped_gaps(bag: Path) -> tuple[TimeGap, ...]:

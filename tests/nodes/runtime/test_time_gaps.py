@@ -149,3 +149,16 @@ def test_a_recorder_whose_clock_was_set_back_is_told_as_its_messages_are_mixed(t
         trajectory(bag, middle, Horizon(3, 0.1))
     assert read_delays(CORNER)["/vicon/car"].backwards == 0
     assert read_delays(bag)["/vicon/car"].backwards > 1
+
+
+def test_a_publisher_that_was_restarted_twice_is_told_and_read(tmp_path, capfd):
+    """Its numbers begin again, as those of a recorder whose clock was set back do; its log times do not."""
+    numbers = iter([*range(5), *range(3), *range(1000)])
+    with BagWriter(tmp_path / "bag", read_attachments(CORNER)) as writer:
+        for message in read_messages(CORNER):
+            sequence = next(numbers) if message.topic == "/vicon/car" else message.sequence
+            writer.write(message.topic, message.cdr, message.log_ns, message.publish_ns, sequence)
+    start_ns = next(message.log_ns for message in read_messages(CORNER, ["/vicon/car"])) + NS // 10
+    expected, found = (trajectory(bag, start_ns, Horizon(3, 0.1)) for bag in (CORNER, tmp_path / "bag"))
+    assert (found == expected).all()
+    assert "the publisher of /vicon/car was restarted 2 times" in capfd.readouterr().err
