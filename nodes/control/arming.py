@@ -255,7 +255,8 @@ class Arming:
             return ""
         asked_ns -= self.clocks.doubt_ns(mono_ns)
         if void := self._void(asked_ns, mono_ns):
-            return void
+            # A wrong clock makes every request look old, and asking again does not help.
+            return self.clocks.problem(mono_ns) or void
         for watched in self._watched():
             watched.restarted = False  # the running process is accepted
         if explicit and source == OPERATOR and not self.hand.pressed_stop:

@@ -160,6 +160,21 @@ def test_clocks_of_two_hosts_make_a_request_older_never_younger(car):
         assert car.arming.clocks.doubt_ns(car.ms * MS) == 3_600_000 * MS
 
 
+@pytest.mark.parametrize("offset_s", [-300.0, -0.2, 300.0])
+def test_a_wrong_clock_is_named_and_not_the_age_that_it_gives_to_a_request(car, offset_s):
+    car.run(2000)
+    info = MessageInfo(car.ms * MS, car.ms * MS, instance_id=1)
+    car.arming.clocks.heard("workstation", offset_s, 0.001, info)
+    for ask_id, asked_ms in (("now", None), ("old", car.ms - 1500), ("before the start", 1)):
+        answer = car.ask(ask_id, asked_ms)
+        expected = f"the clock of workstation is off by {1e3 * offset_s:.0f} ms, the limit is 30 ms"
+        assert (answer.granted, expected in answer.text) == (False, True)
+    assert not car.arming.armed
+    car.arming.clocks.heard("workstation", 0.0, 0.001, info)
+    assert "the request is 1.5 s old" in car.ask("old again", car.ms - 1500).text
+    assert car.ask("right").granted
+
+
 @pytest.mark.parametrize(
     ("published_ms", "stamp_ms", "age_ms", "asked_ms"),
     [
