@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.driving.path import Array, Path
+from advnerf_core.errors import AdvnerfError
 
 # The protocol's rule for driving without an attack, in metres: the car never leaves the track, and its mean |CTE| is at most
 # this share of the off-track limit: 0.08 m in the lab, where the limit is 0.4 m.
@@ -45,6 +46,22 @@ def drives(mean_cte_m: float, off_track: bool, off_track_m: float = LAB_OFF_TRAC
         off_track_m: |CTE| beyond which the car is off the track [m].
     """
     return not off_track and mean_cte_m <= mean_cte_limit_m(off_track_m)
+
+
+class PoseGapError(AdvnerfError, ValueError):
+    """A control tick lies in a gap of a pose stream.
+
+    Attributes:
+        before_ns: Stamp of the last pose before the gap [ns].
+        after_ns: Stamp of the first pose after it [ns].
+    """
+
+    def __init__(self, before_ns: int, after_ns: int) -> None:
+        super().__init__(
+            f"expected no gap over {_MAX_GAP_S} s in the pose stream, got {(after_ns - before_ns) * 1e-9:.2f} s: the car was not tracked, "
+            "or its poses did not arrive; repeat"
+        )
+        self.before_ns, self.after_ns = before_ns, after_ns
 
 
 @dataclass(frozen=True)
@@ -181,6 +198,10 @@ def states_at_ticks(
     Returns:
         ``[K, 3]`` states at the ticks 0..K-1, linear in time between poses, continuous yaw; shorter than the horizon if
         the stream ends early.
+
+    Raises:
+        PoseGapError: A tick lies in a gap of more than 0.5 s.
+        ValueError: The stream is too short, its stamps repeat or go back, or it does not cover the start.
     """
     limits = horizon or Horizon()
     stamps, values = np.asarray(stamps_ns, dtype=np.int64), np.array(poses, dtype=np.float64)
@@ -210,6 +231,5 @@ def _require_no_gap(stamps: NDArray[np.int64], ticks_ns: NDArray[np.int64]) -> N
     before = np.maximum(after - 1, 0)
     gaps_s = np.where(stamps[after] == ticks_ns, 0, stamps[after] - stamps[before]) * 1e-9
     if gaps_s.max() > _MAX_GAP_S:
-        raise ValueError(
-            f"expected no gap over {_MAX_GAP_S} s in the pose stream, got {gaps_s.max():.2f} s: the car was not tracked; repeat"
-        )
+        first = int((gaps_s > _MAX_GAP_S).argmax())
+        raise PoseGapError(int(stamps[before[first]]), int(stamps[after[first]]))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from advnerf_core.documents import read_yaml
+from advnerf_core.documents import Document, read_yaml
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.paths import RESOLVED_NAME
 
@@ -22,6 +22,7 @@ class Launched:
         twin: Whether the simulated lab is one of the nodes.
         port: Serial device of the motor node; empty without one.
         vehicle: Vehicle calibration file of the motor node; empty without one.
+        relayed: Topics of the other host, which this host's gateway publishes; none without a gateway.
     """
 
     known: bool = False
@@ -30,6 +31,7 @@ class Launched:
     twin: bool = False
     port: str = ""
     vehicle: str = ""
+    relayed: tuple[str, ...] = ()
 
     def car(self, run_dir: Path) -> str:
         """Describe the car that the launch drives."""
@@ -52,13 +54,22 @@ def read_launched(run_dir: Path) -> Launched:
     """
     file = run_dir / RESOLVED_NAME
     try:
-        launch = read_yaml(file).data
+        return facts_of(read_yaml(file))
     except FileNotFoundError:
         return Launched()
+
+
+def facts_of(resolved: Document) -> Launched:
+    """Facts of a launch from its resolved launch file, such as the one attached to a bag.
+
+    Raises:
+        ConfigError: It is not what a launch writes.
+    """
+    launch = resolved.data
     entries = (launch.get("nodes") or {}) if isinstance(launch, dict) else None
     if not isinstance(entries, dict) or not all(map(_is_node, entries.values())):
         raise ConfigError(
-            f"{file}: expected nodes with their keys, as advnerf launch writes them, got others; start the launch again"
+            f"{resolved.source}: expected nodes with their keys, as advnerf launch writes them, got others; start the launch again"
         )
     enabled = {name: entry for name, entry in entries.items() if entry.get("if", True)}
     of_module = {entry.get("module"): entry.get("config") or {} for entry in enabled.values()}
@@ -66,4 +77,5 @@ def read_launched(run_dir: Path) -> Launched:
     holds = None if safety is None else safety.get("teleop", "none") == "hold"
     motor = of_module.get("nodes.motor", {})
     port, vehicle = str(motor.get("port", "")), str(motor.get("calibration", ""))
-    return Launched(True, tuple(enabled), holds, "nodes.twin" in of_module, port, vehicle)
+    relayed = tuple(map(str, of_module.get("nodes.gateway", {}).get("imports") or ()))
+    return Launched(True, tuple(enabled), holds, "nodes.twin" in of_module, port, vehicle, relayed)

@@ -10,24 +10,29 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from advnerf_core.driving.metrics import MOVED_M, Horizon
+from advnerf_core.documents import decode_text, parse_yaml
+from advnerf_core.driving.metrics import MOVED_M, Horizon, PoseGapError
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Array
 from calibration.schema import RoomCalibration, load_calibration, parse_calibration
 from nodes.bags.decoded import read_decoded
-from nodes.bags.reader import read_attachments, read_info
+from nodes.bags.reader import read_attachment, read_attachments, read_info, read_messages
 from nodes.bags.time_gaps import skipped_gaps
 from nodes.control.arming_gates import NOT_HELD
 from nodes.control.stop_causes import is_result
 from nodes.lab.trials.evaluation import SHOWN_BY, attack_ids, counterfactual, score, timing, trajectory
+from nodes.launching.launched import facts_of
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import pose_matrix, stamp_ns
+from nodes.runtime.paths import RESOLVED_NAME
 
-_ROOM = "room.yaml"
+_ROOM, _CAR = "room.yaml", "/vicon/car"
 _ACTS, _LET_GO = "/operator/act", "let_go"
 # A drive begins with a car that stands: without an arming before it, this long [s].
 _STOOD_S = 1.0
+# At the edges of a gap, messages of one moment may have crossed the link or not [s].
+_EDGE_S = 0.1
 # Between the page's word about a button and the disarming that follows; the two may be on two hosts [s].
 _TOGETHER_S = 1.0
 _BAG_ENDS = "the bag ends while the car drives"
@@ -56,7 +61,7 @@ def find_drives(bag: Path) -> list[DriveSpan]:
     Raises:
         BagError: The car was never armed, never moved while armed, or was driving when the recording began.
     """
-    _require(bag, ("/safety/state", "/vicon/car"))
+    _require(bag, ("/safety/state", _CAR))
     armings = _armings(bag)
     if not armings:
         raise BagError(
@@ -97,7 +102,7 @@ def _first_motion_ns(stamps: Array, xy: Array, armed_ns: int) -> int | None:
 
 def _ticks_until(stopped_s: float, horizon: Horizon) -> int:
     """Ticks that a drive needs poses for: what comes after its stop is held, and the car may be carried away."""
-    return min(horizon.ticks, int(stopped_s / horizon.dt_s) + 2)
+    return min(horizon.ticks, max(1, horizon.whole_ticks(stopped_s)))
 
 
 def measure_drive(
@@ -107,12 +112,14 @@ def measure_drive(
 
     Args:
         stopped: Why the car was stopped before the horizon's end; empty if it was not. Its last error is then held. If a fault of the stack
-            stopped it, or the bag ends, the drive does not count and has no totals.
+            stopped it, or the bag ends, the drive does not count and has no totals. One whose poses are missing has no states either.
     """
     stopped_s = (span.end_real_ns - span.start_real_ns) / NS_PER_S if stopped else None
     driven = horizon if stopped_s is None else replace(horizon, ticks=_ticks_until(stopped_s, horizon))
     try:
         states = trajectory(bag, span.start_real_ns, driven)
+    except PoseGapError as gap:
+        return _without_poses(bag, span, horizon, gap)
     except ValueError as error:
         raise BagError(f"the drive at {span.start_real_ns / NS_PER_S:.1f} s of {bag}: {error}") from error
     metrics, held = score(states, path, horizon, stopped_s)
@@ -144,6 +151,40 @@ def measure_drive(
     if (compared := counterfactual(bag, span.start_real_ns, span.end_real_ns)) is not None:
         found["counterfactual"] = asdict(compared)
     return found
+
+
+def _without_poses(bag: Path, span: DriveSpan, horizon: Horizon, gap: PoseGapError) -> dict[str, Any]:
+    """A drive that does not count, because poses are missing at its control ticks."""
+    return {
+        "attack_ids": sorted(attack_ids(bag, SHOWN_BY, span.start_real_ns, span.end_real_ns)),
+        "states": [],
+        "stopped_early": _why_no_poses(bag, gap),
+        "counts": False,
+        "driven_ticks": horizon.whole_ticks((gap.before_ns - span.start_real_ns) / NS_PER_S),
+        "cte_m": [],
+        **dict.fromkeys(_TOTALS),
+    }
+
+
+def _why_no_poses(bag: Path, gap: PoseGapError) -> str:
+    """Whether the car was not tracked, or the recorder received none of the topics of the poses' host."""
+    gap_s, edge_ns = (gap.after_ns - gap.before_ns) / NS_PER_S, round(_EDGE_S * NS_PER_S)
+    silent = range(gap.before_ns + edge_ns, gap.after_ns - edge_ns)
+    relayed = _relayed(bag)
+    heard = read_messages(bag, relayed, as_recorded=True)
+    if _CAR not in relayed or any(each.log_ns in silent for each in heard):
+        return f"the car was not tracked for {gap_s:.1f} s"
+    return f"the recorder received nothing from the other host for {gap_s:.1f} s"
+
+
+def _relayed(bag: Path) -> tuple[str, ...]:
+    """Topics that the recorder's host had from another one, by the launch file attached to a bag; none without it."""
+    if RESOLVED_NAME not in read_info(bag).attachments:
+        return ()
+    source = f"{bag}:{RESOLVED_NAME}"
+    text = decode_text(read_attachment(bag, RESOLVED_NAME), source)
+    recorded = {topic.name for topic in read_info(bag).topics}
+    return tuple(name for name in facts_of(parse_yaml(text, source)).relayed if name in recorded)
 
 
 def evaluate_bag(bag: Path, room: Path | None, ticks: int = 60) -> list[dict[str, Any]]:
@@ -222,6 +263,6 @@ def _why_disarmed(reason: str, disarmed_ns: int, let_go: Sequence[tuple[int, str
 
 
 def _positions(bag: Path) -> tuple[Array, Array]:
-    rows = {stamp_ns(pose): pose_matrix(pose)[:2, 3] for pose in read_decoded(bag, "/vicon/car")}
+    rows = {stamp_ns(pose): pose_matrix(pose)[:2, 3] for pose in read_decoded(bag, _CAR)}
     stamps = sorted(rows)
     return np.array(stamps, np.int64), np.array([rows[stamp] for stamp in stamps])

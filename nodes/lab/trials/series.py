@@ -26,7 +26,7 @@ from nodes.lab.trials.plan import (
     keep_plan,
     make_runs,
 )
-from nodes.lab.trials.trial import TrialPlan
+from nodes.lab.trials.trial import SpoiledError, TrialPlan
 from nodes.lab.trials.trial_runner import TICK_S, run_trial
 from nodes.lab.trials.tries import NotDrivenError, drive_with_tries
 from nodes.launching.launch_file import Plan, load_launch
@@ -145,6 +145,8 @@ def _drive_once(
     outcome = run_trial(Path(plan.launch), overrides, run_dir, trial, ready_timeout_s, guide, plan.host)
     # Evaluated from the bag alone, so that `advnerf bag evaluate` gives exactly the same numbers.
     found = measure_drives(run_dir / "bag", series.room, plan.ticks)[-1]
+    if not found["counts"]:
+        raise SpoiledError(found["stopped_early"])
     wanted = [run.attack_id] if run.attack_id else []
     if found["attack_ids"] != wanted:
         raise CampaignError(
