@@ -11,7 +11,7 @@ from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import Now
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import header, types
-from nodes.runtime.node import FAULT
+from nodes.runtime.node import FAULT, READY
 from nodes.runtime.requests import RequestIdentity
 from nodes.runtime.topics import status_topic
 
@@ -54,7 +54,9 @@ def arm_message(asked: RequestIdentity, now: Now, arm: bool, source: str, reason
 def gateway_trouble(status: Received) -> str:
     """Say what a status of the gateway reports about the way to a safety node on another host; empty if nothing is wrong."""
     message = status.message()
-    return f"The gateway reports: {message.text}" if message.state == FAULT else ""
+    # A gateway that is only ready does not hear the other host, which matters where it brings the safety node's word from there.
+    unheard = message.state == READY and STATE in message.publications
+    return f"The gateway reports: {message.text}" if unheard or message.state == FAULT else ""
 
 
 def ask_to_arm(run_dir: Path, reason: str) -> ArmAnswer:
@@ -63,15 +65,15 @@ def ask_to_arm(run_dir: Path, reason: str) -> ArmAnswer:
     Raises:
         LaunchError: The safety node did not answer. On a host without one, it says what the gateway reports about the way there.
     """
-    advice = "Check that the node is running"
+    trouble = ""
 
     def make(asked: RequestIdentity, now: Now) -> Any:
         return arm_message(asked, now, True, OPERATOR, reason)
 
     def read(ask_id: str, received: Received) -> Received | None:
-        nonlocal advice
+        nonlocal trouble
         if received.topic == GATEWAY_STATUS:
-            advice = gateway_trouble(received) or advice
+            trouble = gateway_trouble(received)
         return received if received.topic == STATE and received.message().answered_id == ask_id else None
 
     with Bus(run_dir) as bus:
@@ -79,9 +81,14 @@ def ask_to_arm(run_dir: Path, reason: str) -> ArmAnswer:
         try:
             answered = ask(bus, ARM, make, STATE, read, every_s=_REPEAT_S, patience_s=_ARM_PATIENCE_S)
         except NoAnswerError:
+            advice = (
+                f"{trouble}. To be safe, run advnerf disarm on the car"
+                if trouble
+                else "Check that the node is running. To be safe, run advnerf disarm"
+            )
             raise LaunchError(
                 f"expected an answer from the safety node within {_ARM_PATIENCE_S:g} s, got none; the car may be armed. "
-                f"{advice}. To be safe, run advnerf disarm"
+                f"{advice}"
             ) from None
     state = answered.message()
     text = str(state.source if state.armed else state.reason) if state.granted else str(state.answer)

@@ -16,7 +16,7 @@ import pytest
 
 from nodes.gateway import GatewayConfig, GatewayNode
 from nodes.launching.running import has_ended
-from nodes.linking.keys import KeyFolder
+from nodes.linking.keys import DRIVE, KeyFolder
 from nodes.runtime.arm_requests import arm_message, ask_to_arm
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
@@ -96,6 +96,17 @@ class Lab:
                 return any(wanted(received.message()) for received in bus.receive())
 
             wait_for(reported, what)
+
+    def wait_gateway(self, text):
+        """Wait until the gateway of this host reports this."""
+        with Bus(self.folder) as bus:
+            bus.subscribe("/status/gateway")
+
+            def reported():
+                bus.wait(0.1)
+                return any(text in received.message().text for received in bus.receive())
+
+            wait_for(reported, f"a gateway that reports {text}")
 
     def end(self):
         if self.process is not None:
@@ -198,13 +209,22 @@ def test_why_it_is_not_armed(lab):
     assert answer.startswith("not armed: no pose of the car for ")
 
 
-def test_what_the_gateway_reports_is_added_where_no_safety_node_answers(lab):
+REFUSED = "refused at the drive door of robot: our key robot is not on its list; allow it there"
+SILENT = "the other host has been silent for "
+
+
+@contextlib.contextmanager
+def way_to_a_car(lab, allowed, imports=("/safety/state",)):
+    """The gateway's process of a workstation, and a car without a safety node that allows its key or not. Yields what ends the car."""
     keys = KeyFolder(lab.folder / "keys")
     keys.new("robot")
+    if allowed:
+        keys.allow("robot", DRIVE)
     watch_port, drive_port = free_ports(2)
     common = {"watch_port": watch_port, "drive_port": drive_port, "keys": keys.path}
-    car = GatewayNode(GatewayConfig(listen="127.0.0.1", imports=("/arm",), **common), lambda topic: 0)
-    config = GatewayConfig(connect="127.0.0.1", exports=("/arm",), **common)
+    there = GatewayConfig(listen="127.0.0.1", imports=("/arm",), exports=imports, **common)
+    car = GatewayNode(there, lambda topic: 0)
+    config = GatewayConfig(connect="127.0.0.1", exports=("/arm",), imports=imports, **common)
     settings = [
         part
         for name, value in config.model_dump(mode="json").items()
@@ -212,21 +232,45 @@ def test_what_the_gateway_reports_is_added_where_no_safety_node_answers(lab):
     ]
     program = [sys.executable, "-m", "nodes.gateway", "--folder", str(lab.folder), "--name", "gateway"]
     gateway = subprocess.Popen([*program, *settings])
-    told = "The gateway reports: refused at the drive door of robot: our key robot is not on its list; allow it there"
-    try:
+    with contextlib.ExitStack() as at_the_end:
+        at_the_end.callback(gateway.wait)
+        at_the_end.callback(gateway.terminate)
+        at_the_end.callback(car.inbox.close)
+        end_car = contextlib.ExitStack()
+        end_car.callback(car.close)
+        at_the_end.callback(end_car.close)
+        yield end_car.close
+
+
+@pytest.mark.parametrize(("allowed", "told"), [(False, REFUSED), (True, SILENT)])
+def test_what_the_gateway_reports_is_added_where_no_safety_node_answers(lab, allowed, told):
+    told = f"The gateway reports: {told}"
+    with way_to_a_car(lab, allowed) as end_car:
+        if allowed:
+            wait_for(lambda: "Check that the node is running" in why_not_armed(lab), "a link that is up")
+            end_car()
         wait_for(lambda: told in why_not_armed(lab), "the gateway's report")
-        assert "run advnerf disarm" in why_not_armed(lab)
+        why = why_not_armed(lab)
+        assert (
+            "Check that the node" in why,
+            why.endswith(". To be safe, run advnerf disarm on the car"),
+        ) == (
+            False,
+            True,
+        )
         asking = command(lab, "disarm")
         wait_for(lambda: told in asking.stderr.readline(), "the gateway's report")
         asking.send_signal(signal.SIGINT)
         assert asking.wait(120) == 130
         asking.stdout.close()
         asking.stderr.close()
-    finally:
-        gateway.terminate()
-        gateway.wait()
-        car.close()
-        car.inbox.close()
+
+
+def test_a_host_that_is_not_heard_is_not_blamed_for_the_safety_node_of_this_one(lab):
+    with way_to_a_car(lab, True, imports=("/vicon/board",)) as end_car:
+        end_car()
+        lab.wait_gateway("the other host has not been heard yet")
+        assert "Check that the node is running. To be safe, run advnerf disarm" in why_not_armed(lab)
 
 
 def why_not_armed(lab):
