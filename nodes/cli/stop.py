@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from advnerf_core.errors import AdvnerfError
 from nodes.cli.first_word import promise_first_word, spoken
 
 if TYPE_CHECKING:
@@ -59,8 +60,22 @@ def _stop(run_dir: Path | None, reason: str) -> bool:
         else:
             _say_error(names[report.run_dir] + text)
 
-    stop_runs(list(names), reason, tell)
+    stop_runs(list(names), reason, tell, _why_unreachable)
     return confirmed
+
+
+def _why_unreachable(run_dir: Path) -> str:
+    """Why no request reaches a run any more; empty if one may, or if that cannot be found out."""
+    from nodes.launching.running import is_running
+
+    if is_running(run_dir):
+        return ""
+    from nodes.launching.launched import why_unreachable  # takes a while, in which other runs are not asked
+
+    try:
+        return why_unreachable(run_dir)
+    except (AdvnerfError, OSError):  # such as a damaged file of the run: what is asked must still be asked
+        return ""
 
 
 def _outcome(report: StopReport) -> tuple[str, bool]:

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.documents import Document, read_yaml
+from nodes.launching.launch_hosts import GATEWAY
+from nodes.launching.running import has_ended, is_alive
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.paths import RESOLVED_NAME
 
@@ -79,3 +81,17 @@ def facts_of(resolved: Document) -> Launched:
     port, vehicle = str(motor.get("port", "")), str(motor.get("calibration", ""))
     relayed = tuple(map(str, of_module.get("nodes.gateway", {}).get("imports") or ()))
     return Launched(True, tuple(enabled), holds, "nodes.twin" in of_module, port, vehicle, relayed)
+
+
+def why_unreachable(run_dir: Path) -> str:
+    """Why no request in a run folder whose launch is not running reaches its car. Empty if it may, also in a folder without a launch.
+
+    Raises:
+        ConfigError: The resolved launch file is damaged.
+    """
+    launched = read_launched(run_dir)
+    if "/safety/state" in launched.relayed and not is_alive(run_dir, GATEWAY):
+        return "this host's launch has ended and cannot reach the car; run advnerf disarm on the car"
+    if launched.known and has_ended(run_dir):
+        return "all nodes of this launch have ended; the motor controller brakes after its own timeout"
+    return ""

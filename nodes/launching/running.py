@@ -10,7 +10,8 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from nodes.runtime.paths import bus_folder, private_folder, user_folder, user_folders
+from nodes.runtime.paths import lock_path, private_folder, socket_path, user_folder, user_folders
+from nodes.runtime.topics import STATUS_PREFIX
 
 
 def active_launches() -> list[dict[str, Any]]:
@@ -33,11 +34,23 @@ def is_running(run_dir: Path) -> bool:
 
 def has_ended(run_dir: Path) -> bool:
     """Whether neither a launch nor any node of this host is left in a run folder, by the locks that end with their processes."""
-    locks = [run_dir / "launch.lock", *bus_folder(run_dir).glob("*.lock")]
-    return not any(_is_held(lock) for lock in locks if lock.exists())
+    # Of its status alone: a command that asks for something holds the lock of its own topic.
+    any_status = _status_lock(run_dir, "*")
+    return not is_running(run_dir) and not any(map(_is_held, any_status.parent.glob(any_status.name)))
+
+
+def is_alive(run_dir: Path, name: str) -> bool:
+    """Whether a node of this host runs in a run folder, by the lock of its status."""
+    return _is_held(_status_lock(run_dir, name))
+
+
+def _status_lock(run_dir: Path, name: str) -> Path:
+    return lock_path(socket_path(run_dir, STATUS_PREFIX + name))
 
 
 def _is_held(file: Path) -> bool:
+    if not file.exists():
+        return False
     with open(file, encoding="ascii") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)

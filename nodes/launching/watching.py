@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from nodes.launching.launch_hosts import GATEWAY
 from nodes.launching.launched import read_launched
 from nodes.launching.running import active_launches, has_ended, is_running
 from nodes.runtime.bus import Bus, Received
@@ -95,8 +94,8 @@ def find_run_dir(given: Path | None) -> Path:
 
 
 def require_running(run_dir: Path) -> None:
-    """Raise `LaunchError` if no node is left in a run folder; those on another host are reached by a gateway."""
-    if has_ended(run_dir) and GATEWAY not in read_launched(run_dir).nodes:
+    """Raise `LaunchError` if no node of this host is left in a run folder. Without its gateway, those of another are out of reach."""
+    if has_ended(run_dir):
         raise LaunchError(
             f"expected a running launch in {run_dir}, but all of its nodes have ended; start it with advnerf launch"
         )
@@ -112,10 +111,7 @@ def node_names(run_dir: Path) -> list[str]:
 
 def _launched(run_dir: Path) -> tuple[str, ...]:
     """Names of the nodes of the launch that is running in a run folder."""
-    try:
-        return read_launched(run_dir).nodes if is_running(run_dir) else ()
-    except FileNotFoundError:
-        return ()
+    return read_launched(run_dir).nodes if is_running(run_dir) else ()
 
 
 def node_statuses(run_dir: Path) -> dict[str, Any]:

@@ -9,6 +9,9 @@ from typing import Any
 
 import psutil
 
+from nodes.launching.launch_hosts import GATEWAY
+from nodes.launching.launched import read_launched
+from nodes.launching.running import is_alive
 from nodes.launching.watching import node_names
 from nodes.runtime.bus import Bus
 from nodes.runtime.paths import lock_path, socket_path
@@ -73,6 +76,14 @@ def _describe_silence(run_dir: Path, name: str) -> tuple[int, str]:
     return owner, f"last status {age_s:.1f} s ago; its process is {state}"
 
 
+def _describe_unheard(run_dir: Path, name: str) -> str:
+    """Describe how long nothing was heard of a node on another host. The lock of its status belongs to this host's gateway."""
+    if not is_alive(run_dir, GATEWAY):
+        return "not known, this host's gateway has ended"
+    lock = lock_path(socket_path(run_dir, status_topic(name)))
+    return f"not heard for {max(0.0, time.time() - lock.stat().st_mtime):.1f} s; it runs on another host"
+
+
 def _process_of(name: str, pid: int) -> psutil.Process | None:
     """Process of a node, if it runs on this host. The pid of a node on another host may belong to an unrelated process."""
     try:
@@ -97,6 +108,7 @@ class NodeWatch:
         self._last: dict[str, tuple[float, Any]] = {}
         self._restarts: dict[str, int] = {}
         self._processes: dict[int, psutil.Process] = {}
+        self._relayed: frozenset[str] = frozenset()
 
     def __enter__(self) -> NodeWatch:
         return self
@@ -107,6 +119,7 @@ class NodeWatch:
     def rows(self, duration_s: float) -> list[NodeRow]:
         """Observe for ``duration_s`` [s] and return a row for each node."""
         names = node_names(self._run_dir)
+        self._relayed = frozenset(read_launched(self._run_dir).relayed)
         for name in names:
             self._bus.subscribe(status_topic(name))
         self._first.clear()
@@ -149,7 +162,10 @@ class NodeWatch:
             return None, None
 
     def _silent(self, name: str) -> NodeRow:
-        pid, text = _describe_silence(self._run_dir, name)
+        if status_topic(name) in self._relayed:
+            pid, text = 0, _describe_unheard(self._run_dir, name)
+        else:
+            pid, text = _describe_silence(self._run_dir, name)
         cpu, memory = self._usage(self._process(name, pid) if pid else None)
         restarts = self._restarts.get(name, 0)
         return NodeRow(name, pid, _SILENT, text, cpu, memory, 0.0, 0, 0, restarts, 0)

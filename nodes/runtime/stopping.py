@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from nodes.runtime.arm_requests import (
@@ -117,11 +117,17 @@ class StopRequest:
             self._braked |= received.info.publish_mono_ns >= since_ns and bool(received.message().braking)
 
 
-def stop_runs(run_dirs: Sequence[Path], reason: str, tell: Callable[[StopReport], None]) -> None:
-    """Disarm all runs at the same time, each until its safety node has answered.
+def stop_runs(
+    run_dirs: Sequence[Path],
+    reason: str,
+    tell: Callable[[StopReport], None],
+    why_unreachable: Callable[[Path], str],
+) -> None:
+    """Disarm all runs at the same time, each until its safety node has answered or nothing can reach it any more.
 
     Args:
         tell: Called once for each run with its answer or its trouble, and before, with neither, while there is no answer.
+        why_unreachable: Asked about a run that does not answer: why it never will; empty if it may.
     """
     requests: list[StopRequest] = []
     try:
@@ -134,11 +140,14 @@ def stop_runs(run_dirs: Sequence[Path], reason: str, tell: Callable[[StopReport]
         while waiting:
             for request in list(waiting):
                 request.step(_REPEAT_S / len(waiting))
-                if (report := request.report()).answer is not None:
+                report = request.report()
+                if report.answer is None and not request.late():
+                    continue
+                if report.answer is None:
+                    report = replace(report, trouble=why_unreachable(request.run_dir))
+                if report.answer is not None or report.trouble:
                     waiting.remove(request)
-                    tell(report)
-                elif request.late():
-                    tell(report)
+                tell(report)
     finally:
         for request in requests:
             request.close()

@@ -10,6 +10,7 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from nodes.runtime.arm_requests import arm_message, ask_to_arm
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import LaunchError
+from nodes.runtime.locks import hold
 from nodes.runtime.messages import drive_message, header, pose_message, types
-from nodes.runtime.paths import RESOLVED_NAME
+from nodes.runtime.paths import RESOLVED_NAME, lock_path, socket_path
 from nodes.runtime.requests import RequestIdentity
 from tests.support.disarm import ask_to_disarm
 from tests.support.live.processes import free_ports
@@ -368,6 +370,54 @@ def test_nothing_can_be_armed_where_every_process_has_ended(lab):
     assert has_ended(lab.folder)
     _, errors = command(lab, "car", "arm").communicate(timeout=600)
     assert "all of its nodes have ended; start it" in errors
-    (lab.folder / RESOLVED_NAME).write_text("nodes: {gateway: {module: nodes.gateway}}\n")
-    _, errors = command(lab, "car", "arm").communicate(timeout=600)
-    assert "the car may be armed" in errors  # by a safety node on another host
+
+
+WORKSTATION = """\
+nodes:
+  policy: {module: nodes.policy}
+  gateway: {module: nodes.gateway, config: {imports: [/safety/state, /status/safety]}}
+"""
+OVER = {
+    "nodes: {safety: {module: nodes.safety}}\n": "all nodes of this launch have ended; the motor controller brakes after its own timeout",
+    WORKSTATION: "this host's launch has ended and cannot reach the car; run advnerf disarm on the car",
+}
+
+
+@pytest.mark.parametrize("resolved", OVER)
+def test_an_ended_launch_is_told_and_never_asked_for_ever(tmp_path, resolved):
+    """Of a workstation too: without its gateway no request leaves it."""
+    run = SimpleNamespace(folder=tmp_path)
+    (tmp_path / RESOLVED_NAME).write_text(resolved)
+    for words in (("car", "arm"), ("car", "topic", "list"), ("car", "top")):
+        asking = command(run, *words)
+        output, errors = asking.communicate(timeout=600)
+        assert (asking.returncode, output) == (2, "")
+        assert "but all of its nodes have ended; start it" in errors
+    asking = command(run, "disarm")
+    output, errors = asking.communicate(timeout=600)
+    assert (asking.returncode, output) == (1, "")
+    assert errors == f"error: NOT CONFIRMED: {OVER[resolved]}. The car may be driving. Use the e-stop\n"
+
+
+def test_a_disarm_ends_when_the_gateway_does_although_another_node_stays(lab):
+    (lab.folder / RESOLVED_NAME).write_text(WORKSTATION)
+    lab.start()
+    lab.wait_ready()
+    os.kill(lab.process.pid, signal.SIGSTOP)  # stays, and answers nothing
+    with hold(lock_path(socket_path(lab.folder, "/status/gateway"))):
+        asking = command(lab, "disarm")
+        for _ in range(2):
+            assert "NOT CONFIRMED: no answer" in asking.stderr.readline()
+    _, errors = asking.communicate(timeout=600)
+    assert asking.returncode == 1
+    assert f"NOT CONFIRMED: {OVER[WORKSTATION]}" in errors
+
+
+@pytest.mark.parametrize("resolved", ["nodes: [", "[]"])
+def test_a_damaged_file_of_a_run_ends_no_request_to_stop_its_car(lab, resolved):
+    (lab.folder / RESOLVED_NAME).write_text(resolved)
+    asking = command(lab, "disarm")
+    assert "NOT CONFIRMED: no answer" in asking.stderr.readline()
+    lab.start()
+    output, _ = asking.communicate(timeout=600)
+    assert (asking.returncode, "CONFIRMED: not armed" in output) == (0, True)

@@ -14,6 +14,7 @@ from nodes.launching.watching_nodes import NodeWatch
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_message
+from nodes.runtime.paths import RESOLVED_NAME
 
 pytestmark = pytest.mark.live
 
@@ -40,6 +41,25 @@ def test_delay_of_a_topic_is_split_at_publication(tmp_path):
     assert report.capture_to_receive.median_s >= report.capture_to_publish.median_s
     with pytest.raises(MessageError, match="got 0"):
         measure_rate(tmp_path, "/vicon/board", 0.1)
+
+
+RELAYING = """\
+nodes: {gateway: {module: nodes.gateway, config: {imports: [/status/safety]}}, policy: {module: nodes.policy}}
+"""
+
+
+def test_a_node_on_another_host_is_not_said_to_have_ended_with_this_hosts_gateway(tmp_path):
+    """The lock of its status belongs to the gateway, which relays it."""
+    (tmp_path / RESOLVED_NAME).write_text(RELAYING)
+    with NodeWatch(tmp_path) as watch:
+        with Bus(tmp_path) as gateway:
+            for topic in ("/status/gateway", "/status/safety"):
+                gateway.publisher(topic)
+            told = {row.name: (row.state, row.pid, row.text) for row in watch.rows(0.2)}
+            assert re.fullmatch(r"not heard for \d+\.\d s; it runs on another host", told["safety"][2])
+        told = {row.name: (row.state, row.pid, row.text) for row in watch.rows(0.2)}
+    assert told["safety"] == ("silent", 0, "not known, this host's gateway has ended")
+    assert told["gateway"][2].endswith("its process has ended")
 
 
 @pytest.mark.slow
