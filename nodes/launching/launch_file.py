@@ -12,7 +12,7 @@ from typing import Any
 from advnerf_core.documents import Document, read_yaml
 from advnerf_core.run_module import search_working_folder_last
 from advnerf_core.strict import validate
-from nodes.launching.launch_hosts import choose_host
+from nodes.launching.launch_hosts import ALL_HOSTS, GATEWAY, choose_host
 from nodes.launching.launch_schema import LaunchFile, NodeEntry, RecordEntry
 from nodes.runtime.config import apply_overrides
 from nodes.runtime.errors import ConfigError, TopicError
@@ -78,7 +78,7 @@ def load_launch(
     document.data = with_absolute_code(_substitute(document.data, params, document, ()), file.parent)
     launch = validate(LaunchFile, document)
     if launch.record is not False:
-        _add_recorder(document, launch)
+        _add_recorder(document, launch, host)
         launch = validate(LaunchFile, document)
     choose_host(document, launch, host)
     launch = validate(LaunchFile, document)
@@ -199,7 +199,7 @@ def _substitute(
     return _REFERENCE.sub(lambda match: str(lookup(match[1])), value)
 
 
-def _add_recorder(document: Document, launch: LaunchFile) -> None:
+def _add_recorder(document: Document, launch: LaunchFile, host: str | None) -> None:
     record = RecordEntry() if launch.record is True else launch.record
     assert isinstance(record, RecordEntry)
     if RECORDER in launch.nodes:
@@ -207,6 +207,8 @@ def _add_recorder(document: Document, launch: LaunchFile) -> None:
             f"{document.place(('nodes', RECORDER))}: expected either this node or the key record, got both; remove one of them"
         )
     others = [name for name, entry in launch.nodes.items() if entry.enabled]
+    if launch.hosts and host != ALL_HOSTS:
+        others.append(GATEWAY)  # which is added later, and alone says when the other host was silent
     attachments = [file for file in record.attachments if file]
     limits = record.model_dump(include={"max_bag_duration_s", "max_bag_size_mb"}, exclude_none=True)
     config = {

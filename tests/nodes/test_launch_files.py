@@ -62,6 +62,17 @@ def test_each_starts_what_it_says(file, host, nodes):
     assert set(load_launch(LAUNCH / f"{file}.launch.yaml", keys, host=host).nodes) == nodes
 
 
+@pytest.mark.parametrize(
+    ("overrides", "host", "is_there"),
+    [([], "workstation", True), (["record.host=robot"], "robot", True), ([], "all", False)],
+)
+def test_of_two_hosts_the_gateway_of_the_recorder_is_recorded(overrides, host, is_there):
+    """It alone says in a bag that the link was down."""
+    plan = load_launch(LAUNCH / "two_hosts.launch.yaml", ["keys=keys", *overrides], host=host)
+    statuses = plan.documents["recorder"].data["statuses_of"]
+    assert ("gateway" in statuses, "safety" in statuses) == (is_there, True)
+
+
 def test_the_monitor_launch_shows_the_attack_on_the_monitor_only():
     plan = load_launch(LAUNCH / "monitor.launch.yaml", ["params.attack=a.safetensors"])
     assert plan.documents["monitor"].data["attack"] == "a.safetensors"
