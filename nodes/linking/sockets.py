@@ -22,10 +22,11 @@ MOST_BYTES = 16 * 2**20
 CLOCK, PULSE = b"_clock", b"_pulse"
 _HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS = 500, 3000
 _UNLISTED = int(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
+_ENDED_EARLY = int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
 _FAILURES = {
     _UNLISTED: "its key is not on the list",
     int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "it has no CURVE key, or the wrong key of this host",
-    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): "it ended early",
+    _ENDED_EARLY: "it ended early",
 }
 
 
@@ -189,6 +190,11 @@ class LinkSockets:
             return f"handshake at the {right} door: {_FAILURES[number]}"
         if number == _UNLISTED:
             why = f"our key {own} is not on its list; allow it there with advnerf car keys allow {own} --right {right}"
+        elif number == _ENDED_EARLY:
+            why = (
+                "the connection ended in the handshake: its launch is down behind a tunnel or port forward (start it), or "
+                f"advnerf car keys list does not show the same key {peer} on both hosts"
+            )
         else:
             why = f"the handshake failed; advnerf car keys list must show the same key {peer} on both hosts"
         return f"at the {right} door of {peer}: {why}"

@@ -2,6 +2,7 @@ import contextlib
 import errno
 import os
 import resource
+import select
 import socket
 import stat
 import time
@@ -26,6 +27,10 @@ from tests.support.live.processes import free_ports
 from tests.support.messages import filled
 from tests.support.waiting import wait_for
 
+ENDED_EARLY = (
+    "the connection ended in the handshake: its launch is down behind a tunnel or port forward (start it), or "
+    "advnerf car keys list does not show the same key robot on both hosts"
+)
 ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 
 
@@ -294,10 +299,26 @@ def test_a_host_that_knows_another_key_of_the_car_says_what_to_compare(lab):
     lab.keys["visitor"].path.joinpath("public", "robot.pub").write_bytes(zmq.curve_keypair()[0])
     visitor = lab.workstation("visitor", exports=())
     lab.run(60.0, lambda got: visitor.node.status()[0] == "fault")
-    assert visitor.node.status()[1] == (
-        "refused at the watch door of robot: the handshake failed; "
-        "advnerf car keys list must show the same key robot on both hosts"
-    )
+    assert visitor.node.status()[1] == f"refused at the watch door of robot: {ENDED_EARLY}"
+
+
+def test_a_port_that_accepts_and_closes_is_no_fault_of_the_keys_alone(lab):
+    """As of a tunnel or a port forward to a car that is down."""
+    tunnel = [socket.create_server(("127.0.0.1", port)) for port in lab.ports.values()]
+
+    def accept_and_close():
+        for end in select.select(tunnel, [], [], 0.0)[0]:
+            end.accept()[0].close()
+
+    workstation, told = lab.workstation(), ("fault", f"refused at the drive door of robot: {ENDED_EARLY}")
+    try:
+        lab.run(60.0, lambda got: workstation.node.status() == told, accept_and_close)
+    finally:
+        for end in tunnel:
+            end.close()
+    assert workstation.node.status() == told
+    lab.robot()
+    assert lab.run(60.0, drives, hello(workstation))
 
 
 @contextlib.contextmanager
