@@ -43,14 +43,13 @@ def disarm(
 
 def _run_to_arm(given: Path | None) -> Path:
     """Return the run folder of the launch to arm, after it was named. A person confirms it unless it was started in this folder."""
-    from nodes.launching.launched import read_launched
     from nodes.launching.running import active_launches
-    from nodes.launching.watching import find_run_dir
+    from nodes.launching.watching import describe_car, find_run_dir
     from nodes.runtime.errors import LaunchError
 
     if given is not None:
         run_dir = find_run_dir(given).resolve()
-        print(f"{run_dir}: {read_launched(run_dir).car(run_dir)}")
+        print(f"{run_dir}: {describe_car(run_dir)}")
         return run_dir
     launches = active_launches()
     if not launches:
@@ -58,7 +57,7 @@ def _run_to_arm(given: Path | None) -> Path:
     for number, launch in enumerate(launches, start=1):
         folder = Path(launch["run_dir"])
         mark = f"{number}: " if len(launches) > 1 else ""
-        print(f"{mark}{launch['name']} in {folder}: {read_launched(folder).car(folder)}")
+        print(f"{mark}{launch['name']} in {folder}: {describe_car(folder)}")
     if len(launches) == 1 and launches[0].get("cwd") == os.getcwd():
         return Path(launches[0]["run_dir"])
     if not sys.stdin.isatty():

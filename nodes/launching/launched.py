@@ -25,6 +25,7 @@ class Launched:
         port: Serial device of the motor node; empty without one.
         vehicle: Vehicle calibration file of the motor node; empty without one.
         relayed: Topics of the other host, which this host's gateway publishes; none without a gateway.
+        address: Address of the other host, if this one connects to it; else empty.
     """
 
     known: bool = False
@@ -34,6 +35,7 @@ class Launched:
     port: str = ""
     vehicle: str = ""
     relayed: tuple[str, ...] = ()
+    address: str = ""
 
     def car(self, run_dir: Path) -> str:
         """Describe the car that the launch drives."""
@@ -79,8 +81,9 @@ def facts_of(resolved: Document) -> Launched:
     holds = None if safety is None else safety.get("teleop", "none") == "hold"
     motor = of_module.get("nodes.motor", {})
     port, vehicle = str(motor.get("port", "")), str(motor.get("calibration", ""))
-    relayed = tuple(map(str, of_module.get("nodes.gateway", {}).get("imports") or ()))
-    return Launched(True, tuple(enabled), holds, "nodes.twin" in of_module, port, vehicle, relayed)
+    gateway = of_module.get("nodes.gateway", {})
+    relayed, address = tuple(map(str, gateway.get("imports") or ())), str(gateway.get("connect") or "")
+    return Launched(True, tuple(enabled), holds, "nodes.twin" in of_module, port, vehicle, relayed, address)
 
 
 def why_unreachable(run_dir: Path) -> str:

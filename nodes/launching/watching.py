@@ -20,8 +20,10 @@ from nodes.runtime.messages import stamp_ns
 from nodes.runtime.paths import RESOLVED_NAME, bus_folder
 from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
+from nodes.runtime.twin_port import is_twin
 
-_STATUS_WAIT_S = 1.0
+_SENT = "/motor/sent"
+_STATUS_WAIT_S = _REPORT_WAIT_S = 1.0
 _ECHO_ITEMS = 12
 
 
@@ -99,6 +101,17 @@ def require_running(run_dir: Path) -> None:
         raise LaunchError(
             f"expected a running launch in {run_dir}, but all of its nodes have ended; start it with advnerf launch"
         )
+
+
+def describe_car(run_dir: Path) -> str:
+    """Describe the car that a launch drives. Whether one on another host is real is known from what its motor node reports."""
+    launched = read_launched(run_dir)
+    if _SENT not in launched.relayed:
+        return launched.car(run_dir)
+    reported = (str(each.message().peer) for each in listen(run_dir, _SENT, _REPORT_WAIT_S))
+    if not (peer := next(filter(None, reported), "")):
+        return f"the car at {launched.address}, whose motor node does not report; it may be REAL"
+    return f"{'the simulated' if is_twin(peer) else 'a REAL'} car at {launched.address}, {peer}"
 
 
 def node_names(run_dir: Path) -> list[str]:
