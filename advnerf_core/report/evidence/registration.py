@@ -37,7 +37,8 @@ class RegisteredScenario(StrictModel):
 
     Attributes:
         settings_sha256: Hash of the world and of all settings that a result depends on.
-        settings: All of these settings, including defaults; empty in registrations from before they were stored.
+        settings: All of these settings, including defaults; empty in registrations from before they were stored. Also ``files``, the SHA-256 of each
+            object file, and ``methods``, the digest of each method of the user's own, if there are any: these are not in the hash.
         path: The reference path, as written by `Path.to_dict`.
         ticks: Control ticks of a drive.
         dt_s: Length of a tick [s].
@@ -47,7 +48,7 @@ class RegisteredScenario(StrictModel):
         deployed_starts: Number of starts, from the first, that are deployed.
         evaluations: Closed-loop drives of each search.
         space: Name of the search space.
-        victims: Recipe of the victims: teacher, data, optimiser steps, network.
+        victims: Recipe of the victims: teacher, data, optimiser steps, network; under ``policies`` the content hashes of existing ones.
         drives_well_mean_cte_m: A victim drives well if its mean |CTE| without attack is at most this [m], and it never leaves the track.
     """
 
@@ -78,6 +79,18 @@ class RegisteredScenario(StrictModel):
     def horizon(self) -> Horizon:
         """Horizon of the sums, and the limits."""
         return Horizon(self.ticks, self.dt_s, self.off_track_m, self.held_cap_m)
+
+    def pinned(self, victim: str, method: str) -> dict[str, Any]:
+        """What a cell must have been run with, under the keys of its settings: object files, the code of its method, and its existing policy.
+
+        Only what was registered is there: built-in methods, trained victims and older registrations lack it.
+        """
+        found = {
+            "files": self.settings.get("files"),
+            "code": self.settings.get("methods", {}).get(method),
+            "policy_sha256": self.victims.get("policies", {}).get(victim),
+        }
+        return {name: each for name, each in found.items() if each is not None}
 
     def reference_path(self) -> Path:
         """The path as an object."""

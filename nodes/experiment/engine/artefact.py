@@ -76,6 +76,10 @@ class Settings:
         # Through JSON, so that tuples and lists cannot change a key between processes.
         return cls(*(json.loads(json.dumps({**each, **inputs})) for each in (resolved, keyed)))
 
+    def noting(self, **facts: Any) -> Settings:
+        """The same key, with further facts stored beside it."""
+        return replace(self, resolved={**self.resolved, **facts})
+
 
 def _has_section(model: Any, name: str) -> bool:
     """Whether a field is a section that exists by default."""

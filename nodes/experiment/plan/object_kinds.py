@@ -70,8 +70,10 @@ def is_mesh(kind: str) -> bool:
 
 def files_of(kinds: list[str]) -> dict[str, str]:
     """Hash of each kind that is a file, by its name in results."""
+    from advnerf_core.objects.voxel.mesh_files import read_mesh_files
+
     return {
-        name_of(kind): load_mesh_of(kind).sha256 if is_mesh(kind) else sha256_of(Path(kind))
+        name_of(kind): read_mesh_files(Path(kind))[0].sha256() if is_mesh(kind) else sha256_of(Path(kind))
         for kind in kinds
         if kind not in MADE_HERE_M
     }

@@ -10,19 +10,20 @@ from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.registration import (
     FILE,
     RegisteredCell,
+    RegisteredScenario,
     Registration,
     launch_file,
     read_registration,
     settings_differences,
 )
-from nodes.experiment.engine.artefact import PUBLISHED, Settings
+from nodes.experiment.engine.artefact import PUBLISHED
 from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import runs_alone
 from nodes.experiment.run.store import CellStatus, Store
 from nodes.experiment.run.worker import Job
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.keys import registered_settings, settings_hash
+from nodes.experiment.steps.keys import cell_settings, registered_settings, settings_hash
 from nodes.runtime.errors import ConfigError, RuntimeFault
 
 # In a message.
@@ -43,7 +44,7 @@ def plan_cells(experiment: Experiment, cells: Sequence[Cell]) -> list[Job]:
             cell,
             settings_hash(of, cell.inside),
             threads=1,
-            registration=registered_under(registration, cell, registered_settings(of)),
+            registration=registered_under(registration, cell, of),
             alone=runs_alone(of),
             control_m=_published_control_m(experiment, cell),
         )
@@ -61,13 +62,23 @@ def _published_control_m(experiment: Experiment, cell: Cell) -> tuple[float, ...
     return control.deployed.total_cte_m if same and control.deployed is not None else ()
 
 
-def registered_under(registration: Registration | None, cell: Cell, settings: Settings) -> str:
-    """Digest of the registration of a cell; empty if it is not registered with these settings, its variant's `registered_settings`."""
+def registered_under(registration: Registration | None, cell: Cell, of: Experiment) -> str:
+    """Digest of the registration of a cell; empty if it is not registered with the settings, files, code and victim that its variant ``of`` has."""
     if registration is None or registered_cell(cell) not in registration.cells:
         return ""
     scenario = registration.scenarios.get(cell.scenario)
-    same = scenario is not None and scenario.settings_sha256 == settings.key
+    same = (
+        scenario is not None
+        and scenario.settings_sha256 == registered_settings(of).key
+        and not _pinned_differences(scenario, cell, of)
+    )
     return registration.digest if same else ""
+
+
+def _pinned_differences(scenario: RegisteredScenario, cell: Cell, of: Experiment) -> list[str]:
+    """The files, code and victim of a cell that differ from the registered ones."""
+    found = cell_settings(of, cell.inside).resolved
+    return settings_differences(scenario.pinned(cell.victim, cell.method), found)
 
 
 def not_registered(experiment: Experiment, cells: Sequence[Cell]) -> str:
@@ -80,17 +91,19 @@ def not_registered(experiment: Experiment, cells: Sequence[Cell]) -> str:
         cell
         for cell in cells
         if registered_cell(cell) in registration.cells
-        and not registered_under(registration, cell, registered_settings(experiment.of(cell)))
+        and not registered_under(registration, cell, experiment.of(cell))
     ]
     if not outside:
         return ""
-    scenario = registration.scenarios.get(outside[0].scenario)
-    now = registered_settings(experiment.of(outside[0])).resolved
-    differ = [] if scenario is None else settings_differences(scenario.settings, now)
+    scenario, of = registration.scenarios.get(outside[0].scenario), experiment.of(outside[0])
+    differ = []
+    if scenario is not None:
+        differ = settings_differences(scenario.settings, registered_settings(of).resolved)
+        differ += _pinned_differences(scenario, outside[0], of)
     why = f": {', '.join(differ[:_MOST_DIFFERENCES])}" if differ else ""
     return (
         f"{len(outside)} cells are not run under the registration {PUBLISHED / registration.name / FILE}, and cannot be published in its set, as their "
-        f"settings differ{why}"
+        f"settings, files, code or victims differ{why}"
     )
 
 

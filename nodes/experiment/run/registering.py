@@ -36,7 +36,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import given_in, given_victim
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import planned_evaluations
-from nodes.experiment.steps.keys import own_recipes, registered_settings, require_searchable
+from nodes.experiment.steps.keys import own_recipes, pinned_code, registered_settings, require_searchable
 from nodes.experiment.steps.verdicts import VALIDATED_ON, trained_on, unseen
 
 
@@ -94,7 +94,7 @@ def registered_scenario(experiment: Experiment, name: str) -> RegisteredScenario
     deployed = 0 if config.deploy.through == "nothing" else len(starts[: config.deploy.starts])
     return RegisteredScenario(
         settings_sha256=settings.key,
-        settings=dict(settings.resolved),
+        settings={**settings.resolved, **pinned_code(config)},
         path=experiment.paths[name].to_dict(),
         ticks=limits.ticks,
         dt_s=limits.dt_s,

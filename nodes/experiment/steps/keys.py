@@ -8,11 +8,12 @@ from typing import Any
 
 from advnerf_core.attack.methods import METHODS, black_box_methods, load_method, method_digest, require_method
 from advnerf_core.attack.objectives import OBJECTIVES, ON_THE_PATH, load_objective, objective_key
-from advnerf_core.plugins import PluginError
+from advnerf_core.plugins import PluginError, name_in_results
 from advnerf_core.report.conditions import EMPTY, NONE
 from nodes.experiment.engine.artefact import Settings, digests_in, hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import POLICY, ExperimentConfig
+from nodes.experiment.plan.object_kinds import files_of
 from nodes.experiment.plan.sections import NETWORK
 from nodes.experiment.plan.victims import NAIVE, RETRAINED
 from nodes.experiment.show.context import Experiment
@@ -104,7 +105,10 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
         inputs["geometry"] = hash_of([each.sha256 for each in named_objects(experiment)])
     kept = {name: digest for name, digest in experiment.kept.items() if name in stages}
     inputs["stages"] = {**kept, **digests_in(experiment.folder, stages)}
-    return Settings.of(config, None, free, **inputs, **_common_inputs(experiment, deployed))
+    made = Settings.of(config, None, free, **inputs, **_common_inputs(experiment, deployed))
+    return made.noting(
+        **_object_files(config)
+    )  # a registration has them, which cannot know the digests of stages
 
 
 def _policy_sha256(experiment: Experiment, victim: str) -> str | None:
@@ -138,6 +142,19 @@ def registered_settings(experiment: Experiment) -> Settings:
     }
     own = {"recipes": found} if (found := own_recipes(config)) else {}
     return Settings.of(config, None, FREE, **code, **own, **_common_inputs(experiment))
+
+
+def pinned_code(config: ExperimentConfig) -> dict[str, dict[str, str]]:
+    """What a registration notes beside `registered_settings`, whose key older registrations have: object files, and methods of the user's own."""
+    digests = {name_in_results(each): method_digest(each) for each in config.methods}
+    own = {name: digest for name, digest in digests.items() if digest}
+    return {**_object_files(config), **({"methods": own} if own else {})}
+
+
+def _object_files(config: ExperimentConfig) -> dict[str, dict[str, str]]:
+    """SHA-256 of each object file by its name, as an entry ``files``; none if there are only built-in objects."""
+    found = files_of([each.kind for each in config.objects])
+    return {"files": found} if found else {}
 
 
 def own_recipes(config: ExperimentConfig) -> dict[str, dict[str, Any]]:

@@ -24,7 +24,8 @@ from advnerf_core.policies.tracker import TrackedTrajectory
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.plan import plan_cells, statuses
+from nodes.experiment.run import plan
+from nodes.experiment.run.plan import plan_cells, registered_under, statuses
 from nodes.experiment.run.registering import register
 from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.run.whole import run_experiment
@@ -214,6 +215,28 @@ def test_a_registration_fixes_them_by_hash_before_anything_is_run(folder: Path, 
         }
     }
     assert not experiment.stage_folder("capture").exists()
+
+
+def test_a_policy_that_was_changed_after_its_registration_is_no_evidence(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is looked at again, and its cells alone are run under no registration."""
+    monkeypatch.setattr(plan, "PUBLISHED", tmp_path / "published")
+    file = folder / "mine.experiment.yaml"
+    experiment = load_experiment(file, "tiny", (), tmp_path / "run")
+    registered = register(experiment, experiment.cells, tmp_path / "published")
+    text = (folder / "my_driver.py").read_text()
+    try:
+        (folder / "my_driver.py").write_text(text.replace("manual_seed(0)", "manual_seed(1)"))
+        monkeypatch.delitem(sys.modules, "my_driver")
+        changed = load_experiment(file, "tiny", (), tmp_path / "run")
+        look_at_given(changed)
+        said = plan.not_registered(changed, changed.cells)
+        outside = {each.victim for each in changed.cells if not registered_under(registered, each, changed)}
+    finally:
+        (folder / "my_driver.py").write_text(text)
+    assert (outside, said.startswith("2 cells are not run under the registration")) == ({"module"}, True)
+    assert f"instead of '{registered.scenarios['track'].victims['policies']['module'][:39]}" in said
 
 
 def test_their_camera_is_compared_with_a_world_that_must_be_open_to_be_described(

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from advnerf_core.files import sha256_of
 from advnerf_core.report.evidence.families import coarse_cells_differ
 from advnerf_core.report.evidence.registration import FILE, PlaceClaim, SetError, read_registration
 from nodes.cli.main import app
@@ -19,6 +20,8 @@ from nodes.experiment.run.registering import primary_tests, register, registered
 from nodes.experiment.steps.keys import registered_settings
 from nodes.experiment.steps.run import load_experiment
 from nodes.runtime.errors import ConfigError
+from tests.nodes.experiment.conftest import write_file
+from tests.nodes.experiment.test_own_objects import LENGTH_M, STANDS, billboard
 from tests.support.stage_versions import tiny_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch"
@@ -153,10 +156,56 @@ def test_cells_of_a_registered_file_with_other_values_are_named_before_they_are_
     said = plan.not_registered(other, other.cells)
     assert said.startswith(f"{len(other.cells)} cells are not run under the registration {tmp_path}")
     assert said.endswith(
-        "as their settings differ: attack.evaluations 3 instead of 2, horizon 9 instead of 8"
+        "as their settings, files, code or victims differ: attack.evaluations 3 instead of 2, horizon 9 instead of 8"
     )
     # Another setting of the file is no mistake.
     assert plan.not_registered(replace(other, setting="quick"), other.cells) == ""
+
+
+METHOD = """
+from advnerf_core.attack.methods import Method
+
+def search(problem, settings, run):
+    raise NotImplementedError
+
+Mine = Method(search)
+"""
+
+
+@pytest.mark.parametrize(
+    ("edits", "says", "outside"),
+    [
+        ("board.glb", "files.board.glb ", ["none", "random_coarse", "Mine"]),
+        ("mine.py", "code ", ["Mine"]),
+    ],
+)
+def test_a_mesh_and_a_method_are_registered_by_their_content(tmp_path, monkeypatch, edits, says, outside):
+    """Only the cells that are run with what was changed are no evidence."""
+
+    def made():
+        return load_experiment(
+            file, "tiny", [f"over.method=[none,random_coarse,{tmp_path / 'mine.py'}:Mine]"], tmp_path / "run"
+        )
+
+    billboard(tmp_path / "board.glb")
+    (tmp_path / "mine.py").write_text(METHOD)
+    file = write_file(tmp_path, objects=[{"name": "board", "kind": "board.glb", **STANDS}])
+    monkeypatch.setattr(plan, "PUBLISHED", tmp_path)
+    experiment = made()
+    cells = [cell for cell in experiment.cells if (cell.scenario, cell.victim) == ("right", "hardened")]
+    found = register(experiment, cells, tmp_path)
+    assert found.scenarios["right"].settings["files"] == {"board.glb": sha256_of(tmp_path / "board.glb")}
+    assert plan.not_registered(experiment, cells) == ""
+    before = registered_settings(experiment).key
+    if edits == "board.glb":
+        billboard(tmp_path / "board.glb", 2 * LENGTH_M)
+    else:
+        (tmp_path / "mine.py").write_text(METHOD + "# another\n")
+    other = made()
+    assert says in plan.not_registered(other, cells)
+    assert [cell.method for cell in cells if not registered_under(found, cell, other)] == outside
+    # The key of a registration from before is that of now.
+    assert registered_settings(other).key == before
 
 
 def test_registering_names_the_folder_that_runs_look_into(tmp_path, monkeypatch):
@@ -218,7 +267,7 @@ def test_a_registration_after_the_fact_is_refused(experiment, tmp_path):
 def test_cells_of_the_registered_settings_are_run_under_it_and_no_others(experiment, trained, tmp_path):
     def under(cell, of):
         registration = read_registration(tmp_path / "junction")
-        return registered_under(registration, cell, registered_settings(of))
+        return registered_under(registration, cell, of)
 
     cell = next(each for each in experiment.cells if each.name == GRADIENT)
     assert under(cell, trained) == ""

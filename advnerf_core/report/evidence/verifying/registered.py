@@ -57,14 +57,16 @@ def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
             yield f"{cell.name}: expected {key} {value} as registered, got {found}"
     if bool(scenario.settings) > bool(cell.settings):
         yield f"{cell.name}: expected its settings, as the registration has them, got none"
-    for text in settings_differences(_settings_of(scenario, cell.victim), cell.settings):
+    registered = {**_settings_of(scenario, cell.victim), **scenario.pinned(cell.victim, cell.method)}
+    # Its policy is the one that drove, also in cells from before their settings were stored.
+    for text in settings_differences(registered, {**cell.settings, "policy_sha256": cell.policy_sha256}):
         yield f"{cell.name}: expected the registered settings, got {text}"
     clip = str(cell.extra.get("clip") or cell.name)
     if not clip.startswith(cell.name):
         yield f"{cell.name}: names the clip of another cell, {clip}"
-    registered = evidence.registration.date
-    if not _not_before(cell.date, registered):
-        yield f"{cell.name}: expected a date from {registered} on, when it was registered, got {cell.date}"
+    registered_on = evidence.registration.date
+    if not _not_before(cell.date, registered_on):
+        yield f"{cell.name}: expected a date from {registered_on} on, when it was registered, got {cell.date}"
 
 
 def _settings_of(scenario: RegisteredScenario, victim: str) -> Mapping[str, Any]:
