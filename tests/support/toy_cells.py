@@ -66,6 +66,10 @@ def cell_settings(experiment, cell):
     return registered_settings(experiment)
 
 
+def outdated_stages(experiment, victim):
+    return []
+
+
 def needed_settings(experiment):
     return {"capture": {}, "policy": {}}
 

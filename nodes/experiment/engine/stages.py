@@ -141,6 +141,20 @@ def _current(
     return records
 
 
+def outdated(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | None = None) -> list[str]:
+    """Names of the finished stages in a run folder that a run would make or take anew: their settings or inputs have changed since."""
+    records = _current(stages, folder, reference)
+    found = []
+    for stage in stages:
+        record = read_artefact(folder / stage.name)
+        if record is None or record.digest is None:
+            continue
+        known = (stage.settings, *stage.resumes_from) if all(name in records for name in stage.after) else ()
+        if record.key not in [key_of(replace(stage, settings=each), records) for each in known]:
+            found.append(stage.name)
+    return found
+
+
 def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Settings | None:
     """The settings of a stage's begun folder, if running the stage now would resume it; else None."""
     records = _current(stages, folder)

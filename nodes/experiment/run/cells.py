@@ -11,10 +11,11 @@ from typing import Any
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.report.conditions import NONE
 from hardware.worlds.world import World
-from nodes.experiment.engine.artefact import ReferenceBuild
-from nodes.experiment.engine.stages import Stage, keep_stages
+from nodes.experiment.engine.artefact import REFERENCE, ReferenceBuild
+from nodes.experiment.engine.stages import Stage, keep_stages, outdated
 from nodes.experiment.plan.cell import SEARCHED_SHARE, Cell
 from nodes.experiment.plan.space_config import PlacesConfig
+from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space, over_the_world
 from nodes.experiment.steps.attack import surrogate_part
@@ -23,7 +24,7 @@ from nodes.experiment.steps.films import film_cell
 from nodes.experiment.steps.frozen import check_frozen, freeze
 from nodes.experiment.steps.keys import clean_folder, require_known, stages_needed
 from nodes.experiment.steps.live import LiveNodes
-from nodes.experiment.steps.pipeline import stages_of
+from nodes.experiment.steps.pipeline import stages_of, stages_of_cells
 from nodes.experiment.steps.shared_search import take_search
 from nodes.runtime.progress import Report
 
@@ -141,6 +142,13 @@ def _needed_stages(experiment: Experiment) -> list[Stage]:
         name for victim in experiment.config.attacked for name in stages_needed(experiment.config, victim)
     }
     return [stage for stage in stages_of(experiment) if stage.name in names]
+
+
+def outdated_stages(experiment: Experiment, victim: str) -> list[str]:
+    """Stages in the run folder that a victim's cells need, and that the next run makes anew, as settings or the user's files have changed."""
+    needed = {*stages_needed(experiment.config, victim), *(("retrain",) if victim == RETRAINED else ())}
+    found = outdated(stages_of_cells(experiment), experiment.folder, REFERENCE)
+    return [name for name in found if name in needed]
 
 
 def runs_alone(experiment: Experiment) -> bool:

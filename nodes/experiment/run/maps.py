@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.run.plan import current_key
 from nodes.experiment.run.store import Store
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.pose_maps import draw_maps
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
@@ -23,7 +23,7 @@ def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int | None 
     store, pictures = Store(experiment.folder), []
     for cell in cells:
         inside = experiment.of(cell)
-        status = store.status(cell, settings_hash(inside, cell.inside))
+        status = store.status(cell, current_key(experiment, cell)[0])
         if status.state != "done" or status.result is None:
             continue
         with ProgressDisplay() as display:

@@ -19,10 +19,11 @@ from advnerf_core.report.evidence.registration import (
 from nodes.experiment.engine.artefact import PUBLISHED
 from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.run.cells import runs_alone
+from nodes.experiment.run.cells import outdated_stages, runs_alone
 from nodes.experiment.run.store import CellStatus, Store
 from nodes.experiment.run.worker import Job
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import VictimChangedError
 from nodes.experiment.steps.keys import cell_settings, registered_settings, settings_hash
 from nodes.runtime.errors import ConfigError, RuntimeFault
 
@@ -115,7 +116,11 @@ def registered_cell(cell: Cell) -> RegisteredCell:
 def statuses(experiment: Experiment, cells: Sequence[Cell]) -> list[CellStatus]:
     """State of every cell; a cell whose variant cannot be read yet counts as missing."""
     store = Store(experiment.folder)
-    return [store.status(cell, current_key(experiment, cell), elsewhere(experiment, cell)) for cell in cells]
+    found = []
+    for cell in cells:
+        key, changed = current_key(experiment, cell)
+        found.append(store.status(cell, key, elsewhere(experiment, cell), changed))
+    return found
 
 
 def elsewhere(experiment: Experiment, cell: Cell) -> list[Path]:
@@ -130,15 +135,24 @@ def _published_file(experiment: Experiment, cell: Cell) -> Path:
     return PUBLISHED / experiment.config.name / f"{cell.name}.json"
 
 
-def current_key(experiment: Experiment, cell: Cell) -> str | None:
-    """Hash of everything that a cell depends on; None if it is unknown yet, because the cell's inputs do not exist.
+def current_key(experiment: Experiment, cell: Cell) -> tuple[str | None, str]:
+    """Hash of everything that a cell depends on; None while its inputs do not exist, or once they changed, with what changed.
 
     Raises:
         ConfigError: The cell's variant is wrong.
     """
     try:
-        return settings_hash(experiment.of(cell), cell.inside)
+        of = experiment.of(cell)
+        key = settings_hash(of, cell.inside)
+        if outdated := outdated_stages(of, cell.victim):
+            return (
+                None,
+                f"what {', '.join(outdated)} was made from changed; advnerf experiment run makes it anew",
+            )
+        return key, ""
     except ConfigError:
         raise
+    except VictimChangedError:
+        return None, "its victim changed since it was last looked at; advnerf experiment run looks again"
     except (RuntimeFault, OSError):
-        return None
+        return None, ""

@@ -95,12 +95,15 @@ class Store:
         """Whether the content of the cell's folder belongs to these settings."""
         return has_key(self.work(name) / _KEY, settings_hash)
 
-    def status(self, cell: Cell, settings_hash: str | None, elsewhere: Sequence[Path] = ()) -> CellStatus:
+    def status(
+        self, cell: Cell, settings_hash: str | None, elsewhere: Sequence[Path] = (), changed: str = ""
+    ) -> CellStatus:
         """State of a cell.
 
         Args:
-            settings_hash: Hash of the current settings; None if it is unknown yet, because the cell's inputs do not exist.
+            settings_hash: Hash of the current settings; None if it is unknown yet, because the cell's inputs do not exist, or changed.
             elsewhere: Further files that may have this cell's result: one with the same key counts as finished.
+            changed: What to say of a result with other settings; empty if no more is known.
         """
         name = cell.name
         if self._is_held(name):
@@ -120,7 +123,7 @@ class Store:
         if settings_hash is not None and (error := self.error(name, settings_hash)):
             return CellStatus(cell, "failed", error, result)
         if result is not None:
-            return CellStatus(cell, "changed", "of other settings", result)
+            return CellStatus(cell, "changed", changed or "of other settings", result)
         begun = settings_hash is not None and self.has_begun(name, settings_hash)
         return CellStatus(cell, "begun" if begun else "missing", self._last_line(name) if begun else "")
 

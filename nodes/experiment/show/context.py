@@ -29,7 +29,7 @@ from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.sections import ResponseConfig
 from nodes.experiment.show.experiment_world import ExperimentWorld
-from nodes.experiment.show.given import given_in, given_victim
+from nodes.experiment.show.given import GivenPolicy, given_in, given_victim, last_seen
 from nodes.lab.policy_camera import require_camera, same_camera
 from nodes.lab.policy_data.frames import OWN_VIEW, view_for_camera
 from nodes.lab.worlds.expert_drive import as_path, expert_of
@@ -74,8 +74,13 @@ class Experiment(ExperimentWorld):
 
     @property
     def view_settings(self) -> dict[str, Any]:
-        """Settings of the policy's view that results depend on, as JSON data."""
-        return self.view.to_dict() if given_in(self.config) else self.config.view.model_dump(mode="json")
+        """Settings of the policy's view that results depend on, as JSON data.
+
+        Of existing policies it is the view that was last seen, so that one that was changed since does not leave the others' results unknown.
+        """
+        for name in given_in(self.config):
+            return self._declared_view(name, last_seen(self, name)).to_dict()
+        return self.config.view.model_dump(mode="json")
 
     @cached_property
     def references(self) -> dict[str, ReferencePath]:
@@ -172,21 +177,7 @@ class Experiment(ExperimentWorld):
                 for another camera, or was not loaded yet.
         """
         for name in given_in(self.config):
-            policy = given_victim(self, name)
-            view = policy.declared.view
-            if "view" in self.config.model_fields_set:
-                raise ConfigError(
-                    f"{self.file}: expected no section view with victims.{name}, whose declaration says what it sees; remove the section"
-                )
-            # A calibrated camera may have distortion, which the policy takes out of its pictures; worlds have none.
-            if self.given_scene is not None:
-                require_camera(view, self.camera, policy.policy, f"{self.file}: world.camera")
-            elif not same_camera(view.camera, self.camera) or any(view.distortion):
-                raise ConfigError(
-                    f"{self.file}: victims.{name}: expected a policy that was trained for the driving camera, {self.camera} without distortion, "
-                    f"got {view.camera}{' with distortion' * any(view.distortion)}; correct its declaration, or the world's camera"
-                )
-            return view
+            return self._declared_view(name, given_victim(self, name))
         if "view" not in self.config.model_fields_set:
             self._require_usual_size()
         try:
@@ -195,6 +186,23 @@ class Experiment(ExperimentWorld):
             raise ConfigError(
                 f"{self.file}: view: {error}; give the section view the window of the camera's image that is kept"
             ) from error
+
+    def _declared_view(self, name: str, policy: GivenPolicy) -> PolicyView:
+        """The view of an existing policy, which fits the driving camera."""
+        view = policy.declared.view
+        if "view" in self.config.model_fields_set:
+            raise ConfigError(
+                f"{self.file}: expected no section view with victims.{name}, whose declaration says what it sees; remove the section"
+            )
+        # A calibrated camera may have distortion, which the policy takes out of its pictures; worlds have none.
+        if self.given_scene is not None:
+            require_camera(view, self.camera, policy.policy, f"{self.file}: world.camera")
+        elif not same_camera(view.camera, self.camera) or any(view.distortion):
+            raise ConfigError(
+                f"{self.file}: victims.{name}: expected a policy that was trained for the driving camera, {self.camera} without distortion, "
+                f"got {view.camera}{' with distortion' * any(view.distortion)}; correct its declaration, or the world's camera"
+            )
+        return view
 
     def _require_usual_size(self) -> None:
         usual = OWN_VIEW.camera

@@ -21,7 +21,11 @@ KEPT = "victims.json"
 
 
 class VictimUnknownError(RuntimeFault):
-    """An existing policy was not loaded yet, or has changed since."""
+    """An existing policy was not loaded yet, or not as it is now."""
+
+
+class VictimChangedError(VictimUnknownError):
+    """An existing policy has changed since it was last loaded."""
 
 
 class GivenPolicy(StrictModel):
@@ -63,18 +67,35 @@ def given_victim(experiment: RunFolder, victim: str) -> GivenPolicy:
     """Stored facts about one existing victim, whether or not the others were loaded; nothing of it is executed.
 
     Raises:
-        VictimUnknownError: The victim was not loaded yet, or its file or code has changed since.
+        VictimUnknownError: The victim was not loaded yet.
+        VictimChangedError: Its file or code has changed since.
     """
-    spec, kept = given_in(experiment.config)[victim], read_kept(experiment.folder).get(victim)
-    if kept is None or (kept.policy, kept.source_sha256) != (spec, source_sha256(spec)):
+    kept = last_seen(experiment, victim)
+    if kept.source_sha256 != source_sha256(kept.policy):
         other = "another"
-        if is_factory(spec):
+        if is_factory(kept.policy):
             other += " (all Python files of its package, or else of its folder, count, also added and removed ones)"
-        raise VictimUnknownError(
-            f"{experiment.file}: victims.{victim}: expected {spec} as it was when the experiment was last run, got "
-            f"{'one that was never looked at' if kept is None else other}; run the experiment"
-        )
+        raise VictimChangedError(_unlike(experiment, victim, other))
     return kept
+
+
+def last_seen(experiment: RunFolder, victim: str) -> GivenPolicy:
+    """The same, though its file or code may have changed since.
+
+    Raises:
+        VictimUnknownError: The victim was not loaded yet.
+    """
+    kept = read_kept(experiment.folder).get(victim)
+    if kept is None or kept.policy != given_in(experiment.config)[victim]:
+        raise VictimUnknownError(_unlike(experiment, victim, "one that was never looked at"))
+    return kept
+
+
+def _unlike(experiment: RunFolder, victim: str, found: str) -> str:
+    return (
+        f"{experiment.file}: victims.{victim}: expected {given_in(experiment.config)[victim]} as it was when the experiment was last run, got {found}; "
+        "run the experiment"
+    )
 
 
 def victim_spec(experiment: RunFolder, victim: str) -> str:

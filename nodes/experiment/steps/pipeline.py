@@ -64,7 +64,15 @@ _TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "setti
 
 
 def stages_of(experiment: Experiment) -> list[Stage]:
-    """The stages that cells need; the world must not have been opened for them. A scene of the user's own is only baked.
+    """All stages; the world must not have been opened for them."""
+    config, found = experiment.config, stages_of_cells(experiment)
+    if config.deploy.live and (config.deploy.laps or config.deploy.empty_scene):
+        found.append(_live(experiment))
+    return found
+
+
+def stages_of_cells(experiment: Experiment) -> list[Stage]:
+    """The stages that cells need. A scene of the user's own is only baked.
 
     More rounds of retraining resume from the existing ones.
     """
@@ -78,8 +86,6 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     ]
     if config.retrain is not None:
         found.append(_retrain(experiment, config.retrain.rounds))
-    if config.deploy.live and (config.deploy.laps or config.deploy.empty_scene):
-        found.append(_live(experiment))
     return found
 
 

@@ -295,17 +295,24 @@ def test_other_weights_that_a_factory_reads_are_another_policy(folder: Path, tmp
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-def test_another_policy_under_the_same_name_is_another_cell(folder: Path, tmp_path: Path) -> None:
-    """States of a run folder say so before the policy is ever loaded, and running looks at it again."""
+@pytest.mark.parametrize("changed_first", [False, True])
+def test_another_policy_under_the_same_name_is_another_cell(
+    folder: Path, tmp_path: Path, changed_first: bool
+) -> None:
+    """States of a run folder say so before the policy is ever loaded, of its cells alone, and running looks at it again."""
     shutil.copytree(folder / "run", tmp_path / "run")
+    victims = {"mine": "my.onnx", "module": "my_driver:factory"}
+    named = [f"{name}: {{policy: '{victims[name]}'}}" for name in sorted(victims, reverse=changed_first)]
+    change = (f"victims={{{', '.join(named)}}}",)
     text = (folder / "my_driver.py").read_text()
     try:
         (folder / "my_driver.py").write_text(text.replace("manual_seed(0)", "manual_seed(1)"))
-        changed = load_experiment(folder / "mine.experiment.yaml", "tiny", (), tmp_path / "run")
-        states = {each.cell.victim: each.state for each in statuses(changed, changed.cells)}
+        changed = load_experiment(folder / "mine.experiment.yaml", "tiny", change, tmp_path / "run")
+        states = {each.cell.victim: (each.state, each.text) for each in statuses(changed, changed.cells)}
     finally:
         (folder / "my_driver.py").write_text(text)
-    assert states["module"] == "changed"
+    again = "its victim changed since it was last looked at; advnerf experiment run looks again"
+    assert states == {"mine": ("done", ""), "module": ("changed", again)}
 
 
 def test_a_module_that_is_there_for_a_moment_fails_no_cell(folder: Path, tmp_path: Path) -> None:

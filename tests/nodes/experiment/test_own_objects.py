@@ -8,12 +8,18 @@ import pytest
 import trimesh
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_atomically, write_json
 from advnerf_core.objects.voxel.build import build_from_mesh
 from advnerf_core.objects.voxel.mesh_files import load_mesh
 from advnerf_core.objects.voxel.model import load_object, save_object
+from nodes.experiment.engine.artefact import Artefact, digest_of, write_artefact
+from nodes.experiment.engine.stages import key_of
+from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.object_kinds import extent_m, footprint_m
+from nodes.experiment.run.plan import statuses
 from nodes.experiment.show import objects
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
 from tests.nodes.experiment.conftest import write_file
@@ -118,3 +124,32 @@ def test_voxels_have_no_mesh_to_search(tmp_path: Path) -> None:
     file = write_file(tmp_path, objects=[{"name": "a", "kind": "mine.object.safetensors", **STANDS}])
     with pytest.raises(AdvnerfError, match=r"got voxels .* name the mesh itself"):
         load_experiment(file, "tiny", ["space={kind: mesh_texture}"], tmp_path / "run")
+
+
+def test_cells_of_an_old_mesh_are_not_done(tmp_path: Path) -> None:
+    """Before the stage is made of the new one, and again once the old one is back."""
+    cell, states = Cell("right", "hardened", "none", 0), []
+    billboard(tmp_path / "billboard.glb")
+    experiment = experiment_in(tmp_path, "billboard.glb")
+    records: dict[str, Artefact] = {}
+    for stage in stages_of(experiment):
+        folder = experiment.stage_folder(stage.name)
+        write_atomically(folder / "made.txt", stage.name)
+        records[stage.name] = Artefact(
+            key_of(stage, records), digest_of(folder), 1.0, stage.settings.resolved
+        )
+        write_artefact(folder, records[stage.name])
+    drives = {"total_cte_m": [6.0], "off_track": [True], "none_total_cte_m": [2.0]}
+    found = {
+        **vars(cell.inside),
+        "settings_hash": settings_hash(experiment, cell),
+        "surrogate": drives,
+        "seconds": 1.0,
+    }
+    write_json(experiment.cell_result(cell), {**found, "machine": "m", "date": "d"})
+    for length_m in (LENGTH_M, 1.5 * LENGTH_M, LENGTH_M):
+        billboard(tmp_path / "billboard.glb", length_m)
+        (status,) = statuses(experiment_in(tmp_path, "billboard.glb"), [cell])
+        states.append((status.state, status.text))
+    why = "what object, policy was made from changed; advnerf experiment run makes it anew"
+    assert states == [("done", ""), ("changed", why), ("done", "")]

@@ -1,4 +1,5 @@
 import os
+from dataclasses import replace
 
 import pytest
 
@@ -15,6 +16,7 @@ from nodes.experiment.engine.stages import (
     StageError,
     begun_with,
     keep_stages,
+    outdated,
     run_stages,
     stage_digests,
 )
@@ -220,6 +222,17 @@ def test_a_machine_with_a_reference_build_goes_on_from_it(tmp_path):
     assert run_with(reference, theirs, photographed(third_setting=2))[0] == ["third"]
     assert run_with(reference, theirs, photographed(second_setting=2))[0] == ["first", "second", "third"]
     assert (theirs / "first" / "photos" / "0.jpg").exists()
+
+
+def test_stages_that_a_run_would_make_anew_are_known_before(tmp_path):
+    run_and_note(tmp_path, job())
+    for changed, expected in ((job(), []), (job(2), ["first", "second"]), (job(1, 2), ["second"])):
+        assert outdated(changed, tmp_path) == expected
+        assert outdated(job(1, 2, "never run"), tmp_path / "none") == []
+    fewer = [*job(2)[:1], replace(job()[2], settings=Settings.of(rounds=3), resumes_from=[Settings.of()])]
+    assert outdated(fewer, tmp_path) == ["first"]  # the other is resumed
+    assert run_and_note(tmp_path, job(2)) == ["first"]  # of the same content, so that what it leads to stays
+    assert outdated(job(2), tmp_path) == []
 
 
 def test_without_the_reference_build_all_is_made(tmp_path):
