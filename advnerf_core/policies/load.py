@@ -242,11 +242,27 @@ def policy_file_sha256(path: Path) -> str:
     Raises:
         PolicyContractError: One of them is missing, or is in another folder.
     """
+    files, declared = _files_of(path)
+    return files.sha256(declared.decode())
+
+
+def policy_files(path: Path) -> dict[str, bytes]:
+    """Content of a policy file, of its external weight files and of the declaration beside it, by their names in its folder.
+
+    Raises:
+        PolicyContractError: One of them is missing, or is in another folder.
+    """
+    files, declared = _files_of(path)
+    beside = {path.name + DECLARATION_SUFFIX: declared} if declared else {}
+    return {path.name: files.content, **files.others, **beside}
+
+
+def _files_of(path: Path) -> tuple[InputFiles, bytes]:
     from advnerf_core.policies.onnx_policy import read_onnx
 
     beside = path.with_name(path.name + DECLARATION_SUFFIX)
-    declared = beside.read_text(encoding="utf-8") if beside.is_file() else ""
-    return (read_onnx(path) if path.suffix == ".onnx" else InputFiles(path)).sha256(declared)
+    declared = beside.read_bytes() if beside.is_file() else b""
+    return read_onnx(path) if path.suffix == ".onnx" else InputFiles(path), declared
 
 
 def load_driver(spec: str | os.PathLike[str], expected_sha256: str | None = None) -> Driver:

@@ -30,7 +30,8 @@ def publish(
     build: Annotated[
         bool,
         typer.Option(
-            "--build/--no-build", help="Keep the scenes and victims too, some 20 MB for each place."
+            "--build/--no-build",
+            help="Keep the scenes and victims too, some 20 MB for each place; of a victim that is code, its digest alone.",
         ),
     ] = True,
     withdraw: Annotated[
@@ -49,8 +50,10 @@ def publish(
     ] = None,
 ) -> None:
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
+    from advnerf_core.policies.load import is_code
     from advnerf_core.report.evidence import registration
     from advnerf_core.report.evidence.above import write_above_of
+    from advnerf_core.report.evidence.kept_build import LOST, is_kept
     from advnerf_core.report.evidence.publishing import write_numbers, write_page
     from advnerf_core.report.evidence.registration import SetError
     from advnerf_core.report.evidence.verify import verify_set
@@ -61,6 +64,7 @@ def publish(
     from nodes.experiment.run.published import publish_build
     from nodes.experiment.run.set_film import write_film
     from nodes.experiment.run.store import NOT_DRIVEN
+    from nodes.experiment.show.given import given_in
     from nodes.runtime.config import key_and_value
     from nodes.runtime.errors import ConfigError
 
@@ -101,6 +105,12 @@ def publish(
         print(f"{to / experiment.config.name / name}.json")
     if build:  # before the page, which says whether the set can be driven again
         _say_build(publish_build(experiment, cells, to, prune))
+        if registered and not is_kept(to / experiment.config.name):
+            code = [name for name, spec in given_in(experiment.config).items() if is_code(spec)]
+            why = (
+                f": {', '.join(code)} is code or a driver, of which the digest alone is kept" if code else ""
+            )
+            say_error(f"{experiment.config.name} {LOST}{why}")
     part = verify_set(to / experiment.config.name) if registered else None
     if part is not None and not part.awaits:
         print(write_numbers(to / experiment.config.name))

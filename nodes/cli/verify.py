@@ -34,7 +34,6 @@ def verify(
     seed: Annotated[int, typer.Option(help="Which cells are drawn for that.")] = 0,
 ) -> None:
     """Compute every published number again from the kept drives, and check digests, registration, completeness and the history in git."""
-    from advnerf_core.report.evidence.kept_build import LOST, is_kept
     from advnerf_core.report.evidence.registration import SetError
     from advnerf_core.report.evidence.verify import verify_beside, verify_set
     from advnerf_core.report.evidence.verifying.layout import sets_in
@@ -67,13 +66,11 @@ def verify(
         if not found.problems:
             wrong += _say_problems(list(picture_problems(published / each)))
         if again and not found.problems:
-            if not is_kept(published / each):
-                print(f"{each} {LOST}")
-                continue
             try:
                 wrong += _redrive(published / each, again, seed)
-            except RedriveError as error:
-                print(error)
+            except RedriveError as error:  # of all sets, those that are kept are driven
+                say_error(f"nothing was driven again: {error}")
+                wrong += name is not None
     wrong += _say("page, pictures, films and reference build", verify_beside(published))
     wrong += _history(published)
     wrong += 0 if name else _ledger(published)
@@ -137,14 +134,19 @@ def _ledger(published: Path) -> int:
 
 def _redrive(folder: Path, count: int, seed: int) -> int:
     """Drive some cells of a set again; how many came out otherwise."""
+    from advnerf_core.report.evidence.kept_build import LOST, is_kept
     from advnerf_core.report.evidence.registration import launch_file, read_registration
-    from nodes.experiment.run.redrive import TOLERANCE_M, redrive, unreadable
+    from nodes.experiment.run.redrive import TOLERANCE_M, RedriveError, kept_victims, redrive, unreadable
 
     registration = read_registration(folder)
     assert registration is not None, "the set was verified"
-    file = Path("launch") / launch_file(registration.file)
+    if not is_kept(folder):
+        raise RedriveError(f"{folder.name} {LOST}")
+    name = Path(launch_file(registration.file))
+    file = name if name.exists() else "launch" / name  # a user's own lies where the commands are given
     with TemporaryDirectory() as run:
-        choice = CellChoice(file, registration.setting, Path(run), overrides=list(registration.overrides))
+        changes = [*registration.overrides, *kept_victims(folder, Path(run) / "victims")]
+        choice = CellChoice(file, registration.setting, Path(run) / "run", overrides=changes)
         try:
             experiment, _ = load_cells(choice)
         except ConfigError as error:  # the file, or a key that was set, has another name by now

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.report.evidence.registration import Registration, read_registration
 
-# Folder of the published stages, beside the sets; each has its record.
-BUILD, RECORD = "reference", "stage.json"
-# Stages that are required for driving again.
-_NEEDED = ("scene", "policy")
+# Folder of the published stages, beside the sets; each has its record. Files of existing policies lie beside the stages, as ``VICTIM``.
+BUILD, RECORD, VICTIM = "reference", "stage.json", "victim"
 LOST = "cannot be driven again: its scene or victim was not kept"
 
 
 def is_kept(folder: Path) -> bool:
-    """Whether the reference build beside a set has the scene and the victim of every scenario of it."""
+    """Whether the reference build beside a set has the scene and the victims of every scenario of it."""
     registration = read_registration(folder)
     kept = {digest for file in (folder.parent / BUILD).glob(f"*/{RECORD}") if (digest := _digest_in(file))}
     used = _digests_used(folder, registration) if registration is not None else []
@@ -51,10 +50,14 @@ def _digest_in(record: Path) -> str | None:
 
 
 def _digests_used(folder: Path, registration: Registration) -> list[str | None]:
-    """Digests of scene and victim, of the first cell of every scenario: `verify` checks that the others are equal."""
-    first = {cell.scenario: cell.name for cell in reversed(registration.cells)}
+    """Digests of scene and victim, of the first cell of every victim in a scenario: `verify` checks that the others are equal."""
+    first = {(cell.scenario, cell.victim): cell.name for cell in reversed(registration.cells)}
     files = [file for name in first.values() if (file := folder / f"{name}.json").exists()]
-    stages = [read_json(file).get("stages", {}) for file in files]
+    return [digest for file in files for digest in _digests_of(read_json(file))]
+
+
+def _digests_of(cell: dict[str, Any]) -> tuple[str | None, str | None]:
+    """Digests of scene and victim; an existing victim has no stage, and is there as its files."""
     # A victim with a recipe of its own has a stage of its own, policy-NAME.
-    parts = [{name.partition("-")[0]: digest for name, digest in each.items()} for each in stages]
-    return [each.get(stage) for each in parts for stage in _NEEDED]
+    stages = {name.partition("-")[0]: digest for name, digest in cell.get("stages", {}).items()}
+    return stages.get("scene"), stages.get("policy") or cell.get("policy_sha256")

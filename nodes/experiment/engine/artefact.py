@@ -29,7 +29,7 @@ from nodes.runtime.paths import shipped
 RECORD = kept_build.RECORD
 # Folders of cells and stages that are stored with the code.
 PUBLISHED = Path("docs/results")
-BUILD = kept_build.BUILD
+BUILD, VICTIM = kept_build.BUILD, kept_build.VICTIM
 _KEY_DIGITS = 16
 
 

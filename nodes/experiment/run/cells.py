@@ -6,17 +6,21 @@ from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from functools import cached_property, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from advnerf_core.attack.spaces.space import Space
+from advnerf_core.files import write_atomically
+from advnerf_core.policies.load import is_code, policy_files
 from advnerf_core.report.conditions import NONE
 from hardware.worlds.world import World
-from nodes.experiment.engine.artefact import REFERENCE, ReferenceBuild
+from nodes.experiment.engine.artefact import REFERENCE, VICTIM, Artefact, ReferenceBuild, write_artefact
 from nodes.experiment.engine.stages import Stage, keep_stages, outdated
 from nodes.experiment.plan.cell import SEARCHED_SHARE, Cell
 from nodes.experiment.plan.space_config import PlacesConfig
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import VictimUnknownError, given_in, given_victim
 from nodes.experiment.show.spaces import make_space, over_the_world
 from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import cell_data
@@ -129,7 +133,24 @@ def search_cell(
 
 def keep_build(experiment: Experiment, reference: ReferenceBuild) -> list[Path]:
     """Copy scene, objects and policies into a reference build, without files that only their training reads; returns the new folders there."""
-    return keep_stages(_needed_stages(experiment), experiment.folder, reference)
+    return keep_stages(_needed_stages(experiment), experiment.folder, reference) + [
+        found
+        for victim, spec in given_in(experiment.config).items()
+        if not is_code(spec) and (found := _keep_victim(experiment, victim, Path(spec), reference))
+    ]
+
+
+def _keep_victim(experiment: Experiment, victim: str, file: Path, reference: ReferenceBuild) -> Path | None:
+    """Copy the files of an existing policy into a reference build, as it was last looked at; None if it was there, or has changed since."""
+    try:
+        sha256 = given_victim(experiment, victim).sha256
+    except VictimUnknownError:
+        return None
+    with TemporaryDirectory() as work:
+        for name, content in policy_files(file).items():
+            write_atomically(Path(work) / name, content)
+        write_artefact(Path(work), Artefact(sha256, sha256, 0.0, {"policy": file.name}))
+        return reference.keep(VICTIM, sha256, Path(work))
 
 
 def needed_settings(experiment: Experiment) -> dict[str, Any]:

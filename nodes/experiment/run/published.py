@@ -124,6 +124,7 @@ def publish_build(
 def _prune_build(reference: ReferenceBuild, published: Path) -> list[Path]:
     found = [read_json(file) for file in published.glob("*/*.json")]
     used = {digest for each in found if "stages" in each for digest in each["stages"].values()}
+    used |= {each["policy_sha256"] for each in found if each.get("policy_sha256")}  # of existing victims
     records = {
         file.parent: read_artefact(file.parent) for file in sorted(reference.folder.glob(f"*/{RECORD}"))
     }

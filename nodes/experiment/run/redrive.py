@@ -6,6 +6,7 @@ this version do not matter; if this version would drive differently, the set mus
 
 from __future__ import annotations
 
+import json
 import random
 import shutil
 from collections.abc import Callable
@@ -21,13 +22,14 @@ from advnerf_core.report.evidence.kept import KeptDrive, kept_drives
 from advnerf_core.report.evidence.kept_build import LOST, is_kept
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.verifying.git import last_commit
-from nodes.experiment.engine.artefact import BUILD, Artefact, ReferenceBuild
+from nodes.experiment.engine.artefact import BUILD, VICTIM, Artefact, ReferenceBuild
 from nodes.experiment.engine.stages import key_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench
 from nodes.experiment.run.kept_attacks import attack_file
 from nodes.experiment.run.registering import registered_scenario
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import surrogate_drives, surrogate_part
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import prepare_victims
@@ -78,11 +80,29 @@ def redrive(
         tell(f"{cell.name}: driven again")
         said = read_cell(published / f"{cell.name}.json")
         variant = experiment.of(cell)
+        look_at_given(variant)
         _take_stages(variant, said, ReferenceBuild(published.parent / BUILD))
         _require_same_drives(variant, cell, published)
         again = _again(variant, cell.inside, attack_file(published, said.attack_id or NONE))
         found.append(_compared(cell.name, said.kept["surrogate"], again))
     return found
+
+
+def kept_victims(published: Path, into: Path) -> list[str]:
+    """Copy the existing victims of a set that are kept beside it into a folder; returns the changes of its experiment by which they are its victims.
+
+    Raises:
+        ReferenceBuildError: Their files differ from the kept ones.
+    """
+    registration, build = read_registration(published), ReferenceBuild(published.parent / BUILD)
+    scenarios = () if registration is None else registration.scenarios.values()
+    digests = {name: sha for each in scenarios for name, sha in each.victims.get("policies", {}).items()}
+    found = {name: build.take_digest(VICTIM, sha, sha, into / name) for name, sha in digests.items()}
+    return [
+        f"victims.{name}.policy={json.dumps(str(into / name / record.settings['policy']))}"
+        for name, record in found.items()
+        if record is not None
+    ]
 
 
 def unreadable(published: Path, why: str) -> RedriveError:

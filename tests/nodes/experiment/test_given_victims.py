@@ -12,6 +12,8 @@ import onnxruntime
 import pytest
 import torch
 import yaml
+from click.testing import Result
+from typer.testing import CliRunner
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
@@ -23,9 +25,11 @@ from advnerf_core.policies.onnx_policy import export_onnx
 from advnerf_core.policies.tracker import TrackedTrajectory
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
+from nodes.cli.main import app
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run import plan
 from nodes.experiment.run.plan import plan_cells, registered_under, statuses
+from nodes.experiment.run.published import publish_build
 from nodes.experiment.run.registering import register
 from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.run.whole import run_experiment
@@ -237,6 +241,40 @@ def test_a_policy_that_was_changed_after_its_registration_is_no_evidence(
         (folder / "my_driver.py").write_text(text)
     assert (outside, said.startswith("2 cells are not run under the registration")) == ({"module"}, True)
     assert f"instead of '{registered.scenarios['track'].victims['policies']['module'][:39]}" in said
+
+
+def _command(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.mark.parametrize(
+    ("name", "spec", "kept"), [("mine", "my.onnx", True), ("module", "my_driver:factory", False)]
+)
+def test_a_published_set_is_driven_again_against_its_policy_file(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, spec: str, kept: bool
+) -> None:
+    """With nothing but the published files; a policy that is code is kept by its digest alone, which is said."""
+    for file in ("my.onnx", "my_driver.py", "mine.experiment.yaml"):
+        shutil.copy(folder / file, tmp_path / file)
+    _enter(tmp_path, monkeypatch)
+    (tmp_path / "docs" / "results").mkdir(parents=True)
+    file, change = tmp_path / "mine.experiment.yaml", f"victims={{{name}: {{policy: '{spec}'}}}}"
+    words = (file.name, "--setting", "tiny", "--folder", tmp_path / "run", "--set", change)
+    experiment = load_experiment(file, "tiny", (change,), tmp_path / "run")
+    assert _command("experiment", "register", *words).exit_code == 0
+    run_experiment(experiment)
+    published = _command("experiment", "publish", *words)
+    said = "mine cannot be driven again: its scene or victim was not kept: module is code or a driver"
+    assert (published.exit_code, said in published.output) == (0, not kept), published.output
+    shutil.rmtree(tmp_path / "run")
+    (tmp_path / "my.onnx").unlink()
+    again = _command("verify", "mine", "--redrive", 2)
+    assert again.output.count("at most 0.0000 m from the published poses, as published") == (2 if kept else 0)
+    assert (again.exit_code, "nothing was driven again: mine" in again.output) == (
+        (0, False) if kept else (1, True)
+    )
+    pruned = publish_build(experiment, (), tmp_path / "docs" / "results", prune=True)
+    assert pruned.removed == ()
 
 
 def test_their_camera_is_compared_with_a_world_that_must_be_open_to_be_described(
