@@ -2,7 +2,8 @@
 
 import subprocess
 import sys
-from contextvars import copy_context
+from contextvars import Context, copy_context
+from functools import wraps
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,16 @@ ROOT = Path(__file__).parents[3]
 STYLES = {**CONDITIONS, **SPARE}
 
 
+def alone(test):
+    """A test in a context of its own: commands that earlier tests of this process called may have made methods known."""
+
+    @wraps(test)
+    def run():
+        Context().run(test)
+
+    return run
+
+
 def test_every_condition_has_a_name_a_marker_and_a_colour_of_its_own():
     for values in ([s.title for s in CONDITIONS.values()], [s.marker for s in STYLES.values()]):
         assert len(set(values)) == len(values)
@@ -25,6 +36,7 @@ def test_every_condition_has_a_name_a_marker_and_a_colour_of_its_own():
     assert all(LIGHT[key] == style.light and DARK[key] == style.dark for key, style in STYLES.items())
 
 
+@alone
 def test_a_stranger_is_called_by_its_name_and_keeps_its_colour_in_every_process():
     style = style_of("Spiral")
     assert style.title == "Spiral"
@@ -38,6 +50,7 @@ def test_a_stranger_is_called_by_its_name_and_keeps_its_colour_in_every_process(
     assert len({style_of(f"method{k}").key for k in range(100)}) == 6
 
 
+@alone
 def test_strangers_of_one_table_never_share_a_colour_and_keep_it_in_any_order():
     names = [f"method{k}" for k in range(len(SPARE))]
     assert len({style_of(name).light for name in names}) < len(names)
@@ -58,6 +71,7 @@ def test_strangers_of_one_table_never_share_a_colour_and_keep_it_in_any_order():
     assert style_of("method3").title == "method3"  # outside of that context
 
 
+@alone
 def test_a_smaller_part_of_a_known_table_changes_no_colour():
     names = [f"method{k}" for k in range(12)]
 
