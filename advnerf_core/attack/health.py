@@ -89,14 +89,14 @@ class TickHealth:
     """Diagnostics of a nominal rollout at each tick, means over the starts.
 
     Attributes:
-        lambda_position: Norm of the adjoint's position part at ticks 0..T.
-        lambda_yaw_m: Magnitude of its yaw part at ticks 0..T [m per rad].
+        lambda_position: Norm of the adjoint's position part at ticks 0..T [unit of the objective per m].
+        lambda_yaw: Magnitude of its yaw part at ticks 0..T [unit of the objective per rad].
         saturated: Share of the starts whose steering is at or beyond its limits, at ticks 0..T-1.
         visible: Share of the starts that see an object, at ticks 0..T-1; empty if the sensor cannot say.
     """
 
     lambda_position: tuple[float, ...]
-    lambda_yaw_m: tuple[float, ...]
+    lambda_yaw: tuple[float, ...]
     saturated: tuple[float, ...]
     visible: tuple[float, ...]
 

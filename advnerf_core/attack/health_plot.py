@@ -22,6 +22,7 @@ def draw_health(
     ticks: TickHealth,
     memory_mib: Mapping[int, float],
     split: TimeSplit,
+    unit: str,
 ) -> bytes:
     """PNG of the measurements.
 
@@ -31,14 +32,16 @@ def draw_health(
         closed: The cosine to the true closed loop, over the steps of the finite differences.
         ticks: Diagnostics over time.
         memory_mib: Peak above idle by horizon; may be empty.
+        unit: Unit of the objective.
     """
     figure = Figure(figsize=(11.0, 6.0), layout="constrained", facecolor=LIGHT["paper"])
     axes = figure.subplots(2, 3).ravel()
     _derivatives(axes[0], "frozen poses: adjoint is exact here", adjoint, frozen)
     _cosines(axes[1], closed)
     axes[2].set_title("adjoint states")
-    axes[2].semilogy(np.maximum(ticks.lambda_position, 1e-12), color=LIGHT["none"], label="position")
-    axes[2].semilogy(np.maximum(ticks.lambda_yaw_m, 1e-12), color=LIGHT["gradient"], label="yaw [m/rad]")
+    position, yaw = (np.maximum(each, 1e-12) for each in (ticks.lambda_position, ticks.lambda_yaw))
+    axes[2].semilogy(position, color=LIGHT["none"], label=f"position [{unit}/m]")
+    axes[2].semilogy(yaw, color=LIGHT["gradient"], label=f"yaw [{unit}/rad]")
     axes[2].set_xlabel("tick")
     axes[2].legend()
     axes[3].set_title("share of the starts")

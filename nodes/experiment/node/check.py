@@ -57,6 +57,7 @@ class Check:
         frozen: Derivatives along the directions, by finite differences with frozen poses.
         ticks: Adjoints, saturation and visibility over time.
         memory_mib: Peak above idle by horizon, with an empty cache; empty if it was not measured.
+        unit: Unit of the objective.
     """
 
     frozen_error: float
@@ -69,6 +70,7 @@ class Check:
     ticks: TickHealth
     split: TimeSplit
     memory_mib: dict[int, float]
+    unit: str
 
     @property
     def sound(self) -> bool:
@@ -128,6 +130,7 @@ def check(request: Experiment, directions: int, memory: bool, report: Report) ->
         ticks,
         split,
         _memory(request, report) if memory else {},
+        prepared.problem.objective.unit,
     )
 
 
@@ -196,8 +199,10 @@ def _on_the_drive(found: Check) -> list[str]:
             f"an object is seen in {seen:.0%} of the frames"
             + _because(seen < 0.1, "the attack has little to work with: move the objects toward the path")
         )
-    largest = max(ticks.lambda_yaw_m)
-    lines.append(f"adjoint of the yaw: {ticks.lambda_yaw_m[0]:.3g} m/rad at the start, at most {largest:.3g}")
+    largest = max(ticks.lambda_yaw)
+    lines.append(
+        f"adjoint of the yaw: {ticks.lambda_yaw[0]:.3g} {found.unit}/rad at the start, at most {largest:.3g}"
+    )
     return lines
 
 
@@ -235,6 +240,8 @@ def write_check(found: Check, folder: Path) -> tuple[Path, Path]:
     data["gradient_pass_ms_per_frame"] = 1e3 * found.split.gradient_pass_s / found.split.frames
     table, picture = folder / "check.json", folder / "check.png"
     write_json(table, data)
-    image = draw_health(found.adjoint, found.frozen, found.closed, found.ticks, found.memory_mib, found.split)
+    image = draw_health(
+        found.adjoint, found.frozen, found.closed, found.ticks, found.memory_mib, found.split, found.unit
+    )
     write_atomically(picture, image)
     return table, picture

@@ -1,12 +1,14 @@
 """An objective that a user brings is what a request maximises."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.artifact import load_attack
+from nodes.experiment.node.check import check, write_check
 from nodes.experiment.node.prepare import prepare, request_text
 from nodes.experiment.node.request import parse_request
 from nodes.experiment.node.search import run_attack
@@ -68,3 +70,22 @@ def test_wrong_objectives_are_one_line_before_anything_is_loaded(tmp_path):
     with pytest.raises(ConfigError, match="expected an objective that needs no solids"):
         run_attack(request, tmp_path / "run", ProgressDisplay())
     assert not (tmp_path / "run").exists()
+
+
+def test_the_check_says_adjoints_in_the_unit_of_the_objective(tmp_path):
+    file, found = tiny_request(tmp_path), {}
+    for unit, per_m in (("m", 1.0), ("cm", 100.0)):
+        own = LEFT.replace("    def", f"    unit = {unit!r}\n\n    def").replace(
+            ".sum(0)", f".sum(0) * {per_m}"
+        )
+        (tmp_path / f"in_{unit}.py").write_text(own)
+        request = loaded(file, [f"attack.objective=in_{unit}.py:Left"])
+        found[unit] = check(request, 2, False, lambda fraction, text="": None)
+    start = found["m"].ticks.lambda_yaw[0]
+    assert start > 0.0
+    assert any(f"yaw: {100.0 * start:.3g} cm/rad at the start" in line for line in found["cm"].verdict)
+    pictures = [
+        write_check(replace(found["cm"], unit=unit), tmp_path / name)[1].read_bytes()
+        for name, unit in (("a", "cm"), ("b", "cm"), ("c", "deg"))
+    ]
+    assert pictures[0] == pictures[1] != pictures[2]
