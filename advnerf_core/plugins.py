@@ -273,7 +273,7 @@ def options_of(
     Returns:
         An instance of the model; None without a model.
     """
-    names = _fields_of(model)
+    names = fields_of(model)
     for name in written:
         if name not in names:
             raise error(f"{key}.{name}: {unknown(name, what, names)}")
@@ -286,7 +286,8 @@ def options_of(
         raise error(what_is_wrong(model, (key, *first["loc"]), first)) from None
 
 
-def _fields_of(model: type[Any] | None) -> tuple[str, ...]:
+def fields_of(model: type[Any] | None) -> tuple[str, ...]:
+    """Names of the options of a plug-in, by their dataclass or pydantic model; none without one."""
     if model is None:
         return ()
     if issubclass(model, BaseModel):
@@ -297,9 +298,11 @@ def _fields_of(model: type[Any] | None) -> tuple[str, ...]:
 def unknown(name: str, what: str, known: Iterable[str]) -> str:
     """Message about an unknown name: the valid ones, and the nearest of them."""
     names = list(dict.fromkeys(known))
+    if not names:
+        return f"expected no {what}, as there is none; got {name!r}"
     near = difflib.get_close_matches(name, names, n=1)
     hint = f" (did you mean {near[0]}?)" if near else ""
-    return f"expected {_article(what)} {what} of {', '.join(names) or 'none'}; got {name!r}{hint}"
+    return f"expected {_article(what)} {what} of {', '.join(names)}; got {name!r}{hint}"
 
 
 def _load_entry_point(entry: EntryPoint, what: str) -> Any:

@@ -21,11 +21,13 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.plugins import (
     PluginError,
     code_sha256,
+    fields_of,
     known_names,
     name_in_results,
     options_of,
     require_known,
     resolve,
+    unknown,
 )
 from advnerf_core.policies.architecture import PILOTNET, Architecture, require_architecture
 from advnerf_core.report.conditions import CONDITIONS
@@ -170,6 +172,11 @@ class Method:
         """
         return options_of(self.Options, written, "option of this method", key, MethodError)
 
+    def own_options(self, written: Mapping[str, Any], key: str = "options") -> Any:
+        """As `options`, of what is written for several methods: keys that this one does not have are for the others (`require_options`)."""
+        own = fields_of(self.Options)
+        return self.options({name: value for name, value in written.items() if name in own}, key)
+
 
 def _late(module: str, function: str = "search", *first: str) -> Callable[..., Any]:
     """A function of a module beside the searches, with its first arguments; the module is imported when it is first called."""
@@ -245,6 +252,24 @@ def require_method(reference: str, folder: Path | None = None) -> None:
         raise PluginError(
             f"{_WHAT} {reference}: expected a name that no other condition has, got {name} of {', '.join(taken)}; rename it"
         )
+
+
+def require_options(methods: Mapping[str, Method], written: Mapping[str, Any], key: str = "options") -> None:
+    """Raise for options that are written for several methods, by name, if none of them has one, or a value is wrong.
+
+    Raises:
+        MethodError: Such a key, with the options of each method, or such a value.
+    """
+    has = {name: fields_of(method.Options) for name, method in methods.items()}
+    known = [option for options in has.values() for option in options]
+    for name in written:
+        if name not in known:
+            each = ", ".join(
+                f"{method} has {', '.join(options) or 'none'}" for method, options in has.items()
+            )
+            raise MethodError(f"{key}.{name}: {unknown(name, 'option of a listed method', known)}; {each}")
+    for method in methods.values():
+        method.own_options(written, key)
 
 
 def method_digest(reference: str) -> str:

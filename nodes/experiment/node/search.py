@@ -22,6 +22,7 @@ from nodes.experiment.engine.telling import telling
 from nodes.experiment.node.job import REQUEST, TOGETHER_STATE, is_begun
 from nodes.experiment.node.poses import draw_found
 from nodes.experiment.node.prepare import load_request, prepare, request_text, searched_cell
+from nodes.experiment.plan.rules import check_options
 from nodes.experiment.plan.space_config import MeshShapeConfig, PlacesConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.victims import look_at_given
@@ -58,6 +59,7 @@ def chosen_method(experiment: Experiment) -> tuple[Method, SearchSettings]:
         raise ConfigError(
             f"over.method: expected a method that searches places, {' or '.join(places.METHODS)}, got {name}"
         )
+    check_options(config.methods, config.attack)
     return method, search_settings(experiment, method)
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
-from advnerf_core.attack.methods import METHODS
+from advnerf_core.attack.methods import METHODS, load_method, require_options
+from advnerf_core.plugins import name_in_results
 from nodes.experiment.plan.carriers import CarrierConfig, FaceCarrier
 from nodes.experiment.plan.deploy_config import DeployConfig
 from nodes.experiment.plan.object_kinds import OBJECT_SUFFIX, PANEL, name_of
@@ -19,6 +20,8 @@ from nodes.experiment.plan.space_config import (
     SpaceConfig,
 )
 from nodes.experiment.plan.victims import RETRAINED, TrainingConfig, VictimConfig
+
+_OPTIONS = "attack.options"
 
 
 def _refuse(wrong: object, text: str) -> None:
@@ -182,14 +185,23 @@ def _check_smoothness(space: SpaceConfig, attack: AttackConfig) -> None:
 
 
 def check_methods(methods: Sequence[str], attack: AttackConfig, own_scene: bool) -> None:
-    """Refuse options that a built-in method does not have, and seeds searched together without a gradient; others are looked at when they are loaded."""
-    for name in methods:
-        if (built_in := METHODS.get(name)) is not None:
-            built_in.options(attack.options, "attack.options")
+    """Refuse options that no method has if all are built in (else see `check_options`), and seeds searched together without a gradient."""
+    built_in = [name for name in methods if name in METHODS]
+    if len(built_in) == len(methods):
+        check_options(methods, attack)
+    for name in built_in:
+        METHODS[name].own_options(attack.options, _OPTIONS)
     _refuse(
         attack.together and (list(methods) != ["gradient"] or not own_scene),
         f"attack.together is for the gradient method only, in a learned scene of your own, got {', '.join(methods)}",
     )
+
+
+def check_options(methods: Sequence[str], attack: AttackConfig) -> None:
+    """Refuse options that none of the methods has; a user's method is loaded for it."""
+    if methods and attack.options:
+        found = {name_in_results(each): load_method(each) for each in methods}
+        require_options(found, attack.options, _OPTIONS)
 
 
 def check_searches(

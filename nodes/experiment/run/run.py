@@ -14,6 +14,7 @@ from typing import Any, Literal
 from rich.console import Console
 
 from nodes.experiment.plan.cell import SEARCHED_SHARE, Cell
+from nodes.experiment.plan.rules import check_options
 from nodes.experiment.run.admission import past_the_gate
 from nodes.experiment.run.cells import Bench, needed_settings
 from nodes.experiment.run.plan import elsewhere, not_registered, plan_cells
@@ -193,6 +194,8 @@ def _prepare(experiment: Experiment, cells: Sequence[Cell], options: Options, sa
     for each in wanted.values():
         look_at_given(each)
     require_searchable(experiment, cells)
+    for each in wanted.values():
+        check_options(each.config.methods, each.config.attack)
     _refuse_two_in_one_folder(experiment, cells)
     for name, variant in {each.folder: (name, each) for name, each in reversed(wanted.items())}.values():
         say(f"{name or variant.config.name}: {variant.folder}")

@@ -18,6 +18,7 @@ from nodes.experiment.engine.run_folder import require_own_folder
 from nodes.experiment.engine.stages import Stage, check_until, run_stages
 from nodes.experiment.pages import report
 from nodes.experiment.plan.cell import Cell, select
+from nodes.experiment.plan.rules import check_options
 from nodes.experiment.run.plan import statuses
 from nodes.experiment.run.run import Options, run_cells
 from nodes.experiment.run.store import FINISHED, NOT_DRIVEN
@@ -64,6 +65,7 @@ def run_experiment(
     chosen = select(experiment.cells, only)
     if until in (None, REPORT):
         require_searchable(experiment, chosen)
+        check_options(experiment.config.methods, experiment.config.attack)
     if record is not None:
         names = [stage.name for stage in stages]
         until_there = names if until is None else names[: names.index(until) + 1]

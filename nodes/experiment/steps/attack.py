@@ -295,7 +295,7 @@ def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
         warm_pairs=attack.warm_pairs,
         gradient_rate=attack.learning_rate,
         random_sigma=attack.random_sigma,
-        options=method.options(attack.options, "attack.options"),
+        options=method.own_options(attack.options, "attack.options"),
     )
 
 

@@ -277,6 +277,7 @@ def test_wrong_options_are_one_line_with_their_key(tmp_path, written, message):
     with pytest.raises(MethodError, match=message):
         spiral.options(written, "search.options")
     with pytest.raises(
-        MethodError, match=r"search.options.turns: expected an option of this method of none; got 'turns'"
+        MethodError,
+        match=r"search.options.turns: expected no option of this method, as there is none; got 'turns'",
     ):
         METHODS["gradient"].options({"turns": 1}, "search.options")

@@ -114,7 +114,10 @@ def test_the_attack_node_shows_a_search_that_keeps_no_state(tmp_path):
             ["over.method=[spirel.py:Spiral]"],
             r"over.method.*: attack method spirel.py:Spiral: expected a Python file at .*spirel.py, found none",
         ),
-        (["attack.options.turns=1"], "attack.options.turns: expected an option of this method of none"),
+        (
+            ["attack.options.turns=1"],
+            "attack.options.turns: expected no option of a listed method, .*got 'turns'; gradient has none",
+        ),
         ([FROM_FILE, "attack.together=true"], "gradient method only"),
     ],
 )

@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 
+from advnerf_core.attack.methods import MethodError
 from advnerf_core.report.result_page import text_table
 from nodes.experiment.plan.cell import select
 from nodes.experiment.run.plan import statuses
@@ -102,3 +103,14 @@ def test_what_cannot_be_is_told_with_its_line(searching, methods, says):
     searching.write(seed=[0], method=methods)
     with pytest.raises(ConfigError, match=says):
         searching.load()
+
+
+def test_an_option_that_no_method_of_a_variant_has_ends_a_run_before_its_first_cell(here):
+    write_spiral(here.folder)
+    wrong = {"over.path": ["loop"], "run_folder": "other", "attack.options.turn": 1}
+    here.write(variants={"wrong": wrong}, method=["none", "random", "spiral.py:Spiral"])
+    with pytest.raises(
+        MethodError, match=r"attack.options.turn: .*; random has none, Spiral has turns, growth"
+    ):
+        run(here, jobs=1)
+    assert here.calls == []

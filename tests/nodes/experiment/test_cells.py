@@ -2,13 +2,17 @@
 
 from pathlib import Path
 
-from advnerf_core.attack.methods import METHODS, load_method
+import pytest
+
+from advnerf_core.attack.methods import METHODS, MethodError, load_method
 from advnerf_core.plugins import name_in_results
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import runs_alone
+from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.steps.attack import search_settings
 from nodes.experiment.steps.keys import cell_settings, clean_folder, require_searchable
 from nodes.experiment.steps.run import load_experiment
+from nodes.runtime.errors import ConfigError
 from tests.support.strangers import write_spiral
 
 LAUNCH = Path(__file__).parents[3] / "launch"
@@ -71,3 +75,27 @@ def test_a_method_that_a_user_brings_names_its_cells(tmp_path):
     cell = Cell.of("track", "hardened", reference, 1)
     assert cell.name == f"track_hardened_{name_in_results(reference)}_1"
     assert load_method(cell.reference) is load_method(reference)
+
+
+def test_each_method_takes_its_own_of_the_options_of_all(tmp_path):
+    reference = f"{write_spiral(tmp_path)}:Spiral"
+    asked = [f"over.method=[none,random,'{reference}',guided]", "attack.options.growth=0.4"]
+    experiment = room(tmp_path / "run", *asked, "attack.options.student=resnet")
+    found = {
+        name: search_settings(experiment, load_method(name)).options for name in experiment.config.methods
+    }
+    assert found["random"] is None
+    assert (found[reference].growth, found[reference].turns) == (0.4, 0.1)
+    assert found["guided"].student == "resnet"
+    wrong = room(tmp_path / "run", *asked, "attack.options.turn=1")
+    with pytest.raises(
+        MethodError,
+        match=r"attack.options.turn: .*did you mean turns\?\); random has none, Spiral has turns, growth, guided has student",
+    ):
+        run_experiment(wrong)
+    assert not list((tmp_path / "run").glob("*/stage.json"))
+    with pytest.raises(
+        ConfigError,
+        match=r"options.growth: expected an option of a listed method of student.*; random has none, guided has",
+    ):
+        room(tmp_path / "run", "over.method=[random,guided]", "attack.options.growth=0.4")
