@@ -9,7 +9,7 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.plan import current_key
 from nodes.experiment.run.store import Store
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.pose_maps import draw_maps
+from nodes.experiment.steps.pose_maps import draw_maps, is_mapped
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 
@@ -24,12 +24,13 @@ def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int | None 
     for cell in cells:
         inside = experiment.of(cell)
         status = store.status(cell, current_key(experiment, cell)[0])
-        if status.state != "done" or status.result is None:
+        wanted = inside.config.maps.object if number is None else number
+        if status.state != "done" or status.result is None or not is_mapped(inside, cell.inside, wanted):
             continue
         with ProgressDisplay() as display:
-            report = display.start(cell.name)
-            wanted = inside.config.maps.object if number is None else number
-            pictures += draw_maps(inside, cell.inside, wanted, store.work(cell.name), report)
+            pictures += draw_maps(
+                inside, cell.inside, wanted, store.work(cell.name), display.start(cell.name)
+            )
     if not pictures:
         raise ConfigError(
             f"expected finished cells that have placed objects (space.kind=places), got none of {len(cells)}; run them first, "

@@ -106,11 +106,8 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
     Raises:
         NoSuchCellError: The cell has no object of this number.
     """
-    if not cell.searched or not isinstance(experiment.config.space, PlacesConfig):
+    if not is_mapped(experiment, cell, number):
         return []
-    count = len(experiment.objects)
-    if not 0 <= number < count:
-        raise NoSuchCellError(f"expected an object of 0 to {count - 1}, got {number}")
     attack = load_attack(folder / ATTACK)
     space, name, maps = make_space(experiment, None), experiment.objects[number].name, experiment.config.maps
     problem = Prepared.of(experiment, space, cell).problem
@@ -119,6 +116,20 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
     # In the unit box even if only the plain colours are used.
     theta = sensor.join(sensor.space.unit(places), space.restored(attack).colours)
     return Mapped(problem, theta, attack.sha256, "found").draw(maps, number, folder, report, f"_{name}")
+
+
+def is_mapped(experiment: Experiment, cell: Cell, number: int) -> bool:
+    """Whether a cell moved objects.
+
+    Raises:
+        NoSuchCellError: It has no object of this number.
+    """
+    if not cell.searched or not isinstance(experiment.config.space, PlacesConfig):
+        return False
+    count = len(experiment.objects)
+    if not 0 <= number < count:
+        raise NoSuchCellError(f"expected an object of 0 to {count - 1}, got {number}")
+    return True
 
 
 def _telling(report: Report) -> Callable[[int, int], None]:

@@ -9,10 +9,12 @@ import time
 
 import pytest
 
+from nodes.experiment.run.maps import map_cells
 from nodes.experiment.run.plan import statuses
 from nodes.experiment.run.run import Options, _shares, run_cells
 from nodes.experiment.run.store import Store
 from nodes.experiment.run.worker import take_cell
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.locks import hold
 from tests.support.waiting import wait_for
 
@@ -278,3 +280,13 @@ def test_who_only_looks_at_a_cell_does_not_keep_its_worker_away(tmp_path, capsys
     with working, pytest.raises(SystemExit):
         take_cell(store, "straight_hardened_none_0")
     assert f"is being run by process {os.getpid()}" in capsys.readouterr().err
+
+
+def test_maps_of_cells_without_places_are_refused_before_anything_begins(here, capfd):
+    run(here)
+    loaded = here.load()
+    with pytest.raises(
+        ConfigError, match=r"expected finished cells that have placed objects .*, got none of 3"
+    ):
+        map_cells(loaded, loaded.cells)
+    assert "started" not in "".join(capfd.readouterr())
