@@ -143,9 +143,9 @@ def experiment(
                 page_port if page else None,
             )
         else:
-            if until is not None or anew or page:
+            if page or (anew and until is None):
                 loaded.require_one()
-            ended = _run_variants(loaded, cells, options)
+            ended = _run_variants(loaded, cells, until, options, anew)
     say_wrong(ended)
 
 
@@ -175,10 +175,20 @@ def _run_one(
     return run_with_page(loaded, port, run, lambda text: print(text, flush=True))
 
 
-def _run_variants(loaded: Experiment, cells: Sequence[Cell], options: Options) -> list[Ended]:
+def _run_variants(
+    loaded: Experiment, cells: Sequence[Cell], until: str | None, options: Options, anew: bool
+) -> list[Ended]:
     from nodes.experiment.run.run import run_cells
 
-    ended = run_cells(loaded, cells, options, lambda text: print(text, flush=True))
+    def say(text: str) -> None:
+        print(text, flush=True)
+
+    if until is not None:
+        from nodes.experiment.run.whole import run_stages_of_variants
+
+        run_stages_of_variants(loaded, cells, until, say, anew)
+        return []
+    ended = run_cells(loaded, cells, options, say)
     if not options.search_only:
         show_table(loaded, loaded.cells, page_folder(loaded))
     return ended

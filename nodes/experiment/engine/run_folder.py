@@ -121,7 +121,8 @@ class RunFolder:
         """
         if self.variants:
             raise ConfigError(
-                f"{self.file}: expected an experiment without variants, got {', '.join(self.variants)}; name the file that they change"
+                f"{self.file}: expected an experiment without variants, got {', '.join(self.variants)}; take them out of the section over, or name "
+                "the file that they begin from"
             )
 
     def of(self, cell: Cell) -> Self:

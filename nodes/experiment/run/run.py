@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -196,11 +196,22 @@ def _prepare(experiment: Experiment, cells: Sequence[Cell], options: Options, sa
     require_searchable(experiment, cells)
     for each in wanted.values():
         check_options(each.config.methods, each.config.attack)
+    for variant in one_of_each_folder(experiment, cells, say):
+        prepare_victims(variant)
+        require_same_steering(variant, not options.gate, say)
+
+
+def one_of_each_folder(experiment: Experiment, cells: Sequence[Cell], say: Say) -> Iterator[Experiment]:
+    """The first variant of each run folder of the cells, whose stages are those of all in it; it is told which.
+
+    Raises:
+        ConfigError: A variant is wrong, or two in one folder need other stages; before the first one.
+    """
+    wanted = {cell.variant: experiment.of(cell) for cell in cells}
     _refuse_two_in_one_folder(experiment, cells)
     for name, variant in {each.folder: (name, each) for name, each in reversed(wanted.items())}.values():
         say(f"{name or variant.config.name}: {variant.folder}")
-        prepare_victims(variant)
-        require_same_steering(variant, not options.gate, say)
+        yield variant
 
 
 def _refuse_two_in_one_folder(experiment: Experiment, cells: Sequence[Cell]) -> None:

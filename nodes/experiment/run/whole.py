@@ -20,7 +20,7 @@ from nodes.experiment.pages import report
 from nodes.experiment.plan.cell import Cell, select
 from nodes.experiment.plan.rules import check_options
 from nodes.experiment.run.plan import statuses
-from nodes.experiment.run.run import Options, run_cells
+from nodes.experiment.run.run import Options, Say, one_of_each_folder, run_cells
 from nodes.experiment.run.store import FINISHED, NOT_DRIVEN
 from nodes.experiment.run.worker import Ended
 from nodes.experiment.show.context import Experiment
@@ -86,6 +86,22 @@ def run_experiment(
         markup=False,
     )
     return ended
+
+
+def run_stages_of_variants(
+    experiment: Experiment, cells: Sequence[Cell], until: str, say: Say, anew: bool = False
+) -> None:
+    """Run the unfinished stages of each run folder of an experiment with variants, up to one.
+
+    Raises:
+        StageError: ``until`` names no stage; nothing was run.
+        ConfigError: A variant is wrong, or two in one folder need other stages; nothing was run.
+    """
+    for variant in {cell.variant: experiment.of(cell) for cell in cells}.values():
+        look_at_given(variant)
+        check_until(stages_of(variant), until)
+    for variant in one_of_each_folder(experiment, cells, say):
+        make_ready(variant, until, anew=anew)
 
 
 def _say(console: Console, record: ProgressRecord | None, text: str) -> None:

@@ -41,6 +41,7 @@ from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.keys import driven_folder
 from nodes.experiment.steps.run import load_experiment
 from tests.support import shut_world
+from tests.support.commands import advnerf
 
 TICKS = 3
 MODULE = """
@@ -303,6 +304,36 @@ def test_variants_with_stages_of_their_own_are_run_from_nothing(folder: Path, tm
     again = load_experiment(folder / "mine.experiment.yaml", "tiny", changes, tmp_path / "run")
     ended = run_cells(again, again.cells, Options(here=True), lambda text: None)
     assert {each.name: each.how for each in ended} == {"a_module_none_0": "done", "b_module_none_0": "done"}
+
+
+def test_stages_are_run_up_to_one_of_an_experiment_with_an_axis_once(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+
+    def called(*words: str) -> object:
+        changes = (f"run_folder={run}", "over.attack.evaluations=[3,5]")
+        given = [word for each in changes for word in ("--set", each)]
+        return advnerf(
+            monkeypatch,
+            "experiment",
+            "run",
+            folder / "mine.experiment.yaml",
+            "--setting",
+            "tiny",
+            *given,
+            *words,
+        )
+
+    assert called("--until", "capturing") != 0
+    assert "expected one of the stages capture, " in capsys.readouterr().err
+    assert not list(run.glob("*/stage.json"))
+    assert called("--until", "capture") == 0
+    assert capsys.readouterr().out.count("capture: started") == 1
+    assert [each.parent.name for each in run.glob("*/stage.json")] == ["capture"]
+    assert called("--page") != 0
+    said = capsys.readouterr().err
+    assert "got evaluations-3, evaluations-5; take them out of the section over" in said
 
 
 def test_a_black_box_has_no_gradient(folder: Path) -> None:
