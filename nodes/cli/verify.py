@@ -135,15 +135,14 @@ def _ledger(published: Path) -> int:
 def _redrive(folder: Path, count: int, seed: int) -> int:
     """Drive some cells of a set again; how many came out otherwise."""
     from advnerf_core.report.evidence.kept_build import LOST, is_kept
-    from advnerf_core.report.evidence.registration import launch_file, read_registration
+    from advnerf_core.report.evidence.registration import read_registration, registered_file
     from nodes.experiment.run.redrive import TOLERANCE_M, RedriveError, kept_victims, redrive, unreadable
 
     registration = read_registration(folder)
     assert registration is not None, "the set was verified"
     if not is_kept(folder):
         raise RedriveError(f"{folder.name} {LOST}")
-    name = Path(launch_file(registration.file))
-    file = name if name.exists() else "launch" / name  # a user's own lies where the commands are given
+    file = registered_file(registration.file)
     with TemporaryDirectory() as run:
         changes = [*registration.overrides, *kept_victims(folder, Path(run) / "victims")]
         choice = CellChoice(file, registration.setting, Path(run) / "run", overrides=changes)

@@ -143,7 +143,7 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
         parts += ["### Over places and victims\n", *map(_place_claim, data["claims"])]
     if explored:
         parts += ["### Not registered\n", "Run, and not registered before.\n", _table(explored)]
-    parts += ["### How to run it\n", _commands(name, data["registered"])]
+    parts += ["### How to run it\n", _commands(name, data)]
     return "\n".join(parts)
 
 
@@ -386,10 +386,13 @@ def _cells(row: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _commands(name: str, registration: Mapping[str, Any]) -> str:
+def _commands(name: str, data: Mapping[str, Any]) -> str:
+    registration = data["registered"]
     setting = f" --setting {registration['setting']}" if registration["setting"] else ""
     changes = "".join(f" --set {text}" for text in registration["overrides"])
-    what = f"launch/{launch_file(registration['file'])}{setting}{changes}"
+    # A registration keeps the name of its file alone. Sets of this project, which have facts in `about`, are in its folder launch.
+    folder = "launch/" if data.get("about") else ""
+    what = f"{folder}{launch_file(registration['file'])}{setting}{changes}"
     return "\n".join(
         [
             f"    advnerf experiment run {what}",

@@ -222,6 +222,13 @@ def launch_file(text: str) -> str:
     return text.replace(".campaign.yaml", ".experiment.yaml")
 
 
+def registered_file(text: str) -> FilePath:
+    """The experiment file of a registration, which keeps its name alone: in ``launch`` of the working folder, else in that folder itself."""
+    name = launch_file(text)
+    inside = FilePath("launch") / name
+    return inside if inside.is_file() else FilePath(name)
+
+
 def settings_differences(
     registered: Mapping[str, Any], found: Mapping[str, Any], above: str = ""
 ) -> list[str]:

@@ -21,6 +21,7 @@ from advnerf_core.report.evidence.registration import (
     WITHDRAWN,
     SetError,
     read_registration,
+    registered_file,
     require_registered,
     withdraw,
 )
@@ -567,3 +568,15 @@ def test_a_registration_that_makes_no_sense_is_a_problem_and_no_crash(copied):
     (problem,) = verify_set(copied).problems
     assert "expected a closed path" in problem
     assert "restore it from git" in problem
+
+
+def test_the_commands_of_a_set_of_a_user_name_the_file_that_was_registered(copied, tmp_path, monkeypatch):
+    registered = read_registration(copied)
+    assert registered is not None
+    page = write_page(copied.parent).read_text()
+    assert f"\n    advnerf experiment run {registered.file}\n" in page
+    monkeypatch.chdir(tmp_path)
+    assert registered_file("mine.campaign.yaml") == Path("mine.experiment.yaml")
+    (tmp_path / "launch").mkdir()
+    (tmp_path / "launch" / "mine.experiment.yaml").touch()
+    assert registered_file("mine.campaign.yaml") == Path("launch/mine.experiment.yaml")
