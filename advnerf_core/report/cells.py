@@ -63,7 +63,7 @@ class CellResult(StrictModel):
         settings_hash: Hash of everything that the result depends on.
         settings: All of these settings, including defaults; empty in cells from before they were stored.
         stages: Digests of the capture, scene, object and policy stages' outputs; empty in cells from before they were stored.
-        seconds: Duration of the cell [s].
+        seconds: Duration of the cell, also of its drives [s]; in older files of its search alone.
         date: Date and time, ISO.
         surrogate: Drives in the learned scene; for an attack over the deployment scene's own frames (meshes) the ideal car's drives there.
         deployed: Drives in the deployment; None until they are driven.

@@ -272,9 +272,8 @@ def _run(
         "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
-    spent = _add_seconds(work, time.monotonic() - began)
-    seconds = found["seconds"] if found.get("seconds") is not None else spent
-    store.keep_result(job.name, {**found, **ours, "seconds": round(float(seconds), 1)})
+    spent_s = _add_seconds(work, time.monotonic() - began)
+    store.keep_result(job.name, {**found, **ours, "seconds": round(spent_s, 1)})
 
 
 def wait_for_live() -> TextIO:

@@ -81,7 +81,7 @@ def cell_data(
         control_m: Total CTE of each start without attack [m], if it was driven already; see `worker.Job`.
 
     Returns:
-        Attack id, seconds; for ``surrogate`` and ``deployed`` the total CTE [m] and whether the car left the track, per start, and the total
+        Attack id; for ``surrogate`` and ``deployed`` the total CTE [m] and whether the car left the track, per start, and the total
         CTE without attack; see `advnerf_core.report.cells`. A cell that was not driven live has no ``deployed``, but the reason.
     """
     learned, undisturbed = (read_json(at / SEARCHED) for at in (folder, clean))
@@ -91,7 +91,6 @@ def cell_data(
         "method": cell.method,
         "seed": cell.seed,
         "attack_id": learned["attack_id"],
-        "seconds": round(learned["seconds"], 1),
         "policy_sha256": learned["policy_sha256"],
         "surrogate": _drives_of(learned, undisturbed["total_cte_m"]),
         "kept": {"surrogate": kept_drives(learned)},

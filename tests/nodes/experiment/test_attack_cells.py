@@ -64,7 +64,7 @@ def finished(experiment: Experiment, scene: Any, cell: Cell) -> dict[str, Any]:
     at = clean if cell.method == "none" else folder
     surrogate_part(experiment, space, cell, at, silent)
     data = cell_data(experiment, space, scene, cell, at, clean, print)
-    kept = {**data, "settings_hash": "h", "machine": "m", "date": "d"}
+    kept = {**data, "settings_hash": "h", "machine": "m", "date": "d", "seconds": 1.0}
     experiment.cell_result(cell).write_text(json.dumps(kept))
     return data
 

@@ -82,7 +82,9 @@ def test_meshes_are_searched_over_the_pictures_of_the_world(
 ) -> None:
     experiment, cell = searching(trained, space), Cell("straight", "hardened", "gradient", 0)
     data = whole(experiment, wall, cell, tmp_path)
-    result = cell_from({**data, "settings_hash": "h", "machine": "m", "date": "d"}, "the cell")
+    result = cell_from(
+        {**data, "settings_hash": "h", "machine": "m", "date": "d", "seconds": 1.0}, "the cell"
+    )
     assert data["extra"]["evaluations"] == experiment.config.attack.evaluations
     assert result.deployed is not None
     assert all(np.isfinite(drives.total_cte_m).all() for drives in (result.surrogate, result.deployed))

@@ -304,6 +304,10 @@ def test_variants_with_stages_of_their_own_are_run_from_nothing(folder: Path, tm
     again = load_experiment(folder / "mine.experiment.yaml", "tiny", changes, tmp_path / "run")
     ended = run_cells(again, again.cells, Options(here=True), lambda text: None)
     assert {each.name: each.how for each in ended} == {"a_module_none_0": "done", "b_module_none_0": "done"}
+    for each in ended:  # a control searches nothing, but it drives
+        result = read_json(tmp_path / "run" / "cells" / f"{each.name}.json")
+        spent_s = float((tmp_path / "run" / "cells" / each.name / "seconds").read_text())
+        assert 0.0 < result["seconds"] == round(spent_s, 1) <= each.seconds + 0.05
 
 
 def test_stages_are_run_up_to_one_of_an_experiment_with_an_axis_once(

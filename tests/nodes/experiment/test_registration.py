@@ -286,7 +286,8 @@ def test_a_cell_keeps_its_drives(trained, tmp_path):
     cell = next(each for each in trained.cells if each.name == "right_hardened_random_0")
     data = run_cell(trained, cell, tmp_path / cell.name, lambda fraction, text="": None)
     result = cell_from(
-        json.loads(json.dumps({**data, "settings_hash": "", "machine": "", "date": ""})), "a cell"
+        json.loads(json.dumps({**data, "settings_hash": "", "machine": "", "date": "", "seconds": 1.0})),
+        "a cell",
     )
     for domain, drives in (("surrogate", result.surrogate), ("deployed", result.deployed)):
         (kept,) = result.kept[domain]

@@ -45,7 +45,7 @@ def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
     with Bench(experiment) as bench:
         for cell in experiment.cells:
             data = run_cell(experiment, cell, experiment.cell_folder(cell), silent, bench)
-            kept = {**data, "settings_hash": "h", "machine": "m", "date": "d"}
+            kept = {**data, "settings_hash": "h", "machine": "m", "date": "d", "seconds": 1.0}
             experiment.cell_result(cell).write_text(json.dumps(kept))
     report.run(experiment, folder / "report", silent)
 
