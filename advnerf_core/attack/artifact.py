@@ -161,6 +161,16 @@ class AttackFile:
     field_total_cte_m: float | None = None
 
     @property
+    def objective_in_words(self) -> str:
+        """Objective and value, and the value without an attack if the file has it; empty for ``cte``, whose value is the predicted total CTE."""
+        found = self.extra.get("objective")
+        if found is None:
+            return ""
+        clean, unit = found.get("clean_value"), found["unit"]
+        beside = "" if clean is None else f", without attack {clean:.4g} {unit}"
+        return f"{found['name']} {found['value']:.4g} {unit}{beside}"
+
+    @property
     def value(self) -> float | None:
         """Value of the objective, averaged over starts, in its own unit; for ``cte`` it is the predicted total CTE [m]."""
         found = self.extra.get("objective")

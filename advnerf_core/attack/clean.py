@@ -15,6 +15,11 @@ def clean_drive(problem: AttackProblem, plain_theta: Tensor) -> CleanDrive:
     Args:
         plain_theta: Parameters of the objects without an attack.
     """
-    rollout, _ = evaluate(problem.undisturbed(), plain_theta)
+    return clean_drive_and_value(problem, plain_theta)[0]
+
+
+def clean_drive_and_value(problem: AttackProblem, plain_theta: Tensor) -> tuple[CleanDrive, float]:
+    """As `clean_drive`, and the objective's value of the same drives, mean over the starts, in the objective's unit."""
+    rollout, totals = evaluate(problem.undisturbed(), plain_theta)
     drives = problem.judged(rollout.states)
-    return CleanDrive.of(drives.metrics, drives.horizon)
+    return CleanDrive.of(drives.metrics, drives.horizon), float(totals.values.mean())

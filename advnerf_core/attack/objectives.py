@@ -90,11 +90,12 @@ def objective_key(reference: str) -> str | list[str]:
     return [name_in_results(reference), code] if code else reference
 
 
-def objective_entry(reference: str, objective: Objective, value: float) -> dict[str, Any]:
-    """Entry of the objective in an attack file: name, unit and value. Empty for ``cte``, whose value is the predicted total CTE."""
+def objective_entry(reference: str, objective: Objective, value: float, clean_value: float) -> dict[str, Any]:
+    """Entry of the objective in an attack file: name, unit, value, and the value without an attack. Empty for ``cte``, whose values are total CTE."""
     if reference == CTE:
         return {}
-    return {"objective": {"name": name_in_results(reference), "unit": objective.unit, "value": value}}
+    values = {"value": value, "clean_value": clean_value}
+    return {"objective": {"name": name_in_results(reference), "unit": objective.unit, **values}}
 
 
 def _row(name: str) -> Callable[[], Any]:

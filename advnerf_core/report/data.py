@@ -74,11 +74,26 @@ def face_segment(T_world_from_face: ArrayLike, width_m: float) -> NDArray[np.flo
 
 @dataclass(frozen=True, eq=False)
 class LossCurve:
-    """Excess |CTE| per tick of each evaluation of one search, ``[E]`` [m]: over the plain object, from its starts, over its ticks."""
+    """The evaluations of one search.
+
+    Attributes:
+        values: Excess |CTE| per tick of each over the plain object, from its starts, over its ticks ``[E]`` [m]; with `Drives.maximised`
+            the value of that instead, in its unit.
+        plain: The same of the plain object; None if it is not known.
+    """
 
     method: str
-    excess_m: Floats
+    values: Floats
     victim: str = "hardened"
+    plain: float | None = 0.0
+
+
+@dataclass(frozen=True)
+class Maximised:
+    """An objective other than ``cte``, and the unit of its values."""
+
+    name: str
+    unit: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +131,7 @@ class Drives:
         curves: Loss curves of the searches.
         film: The driving camera's images past the plain, random and attacked object; None without a film.
         seen: Camera images of the objects, by method.
+        maximised: What the searches maximised; None for the total CTE.
     """
 
     scenario: str
@@ -125,6 +141,7 @@ class Drives:
     curves: tuple[LossCurve, ...] = ()
     film: Film | None = None
     seen: Mapping[str, Image] = field(default_factory=dict)
+    maximised: Maximised | None = None
 
     @property
     def victims(self) -> tuple[str, ...]:

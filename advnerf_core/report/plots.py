@@ -91,34 +91,37 @@ def cte_over_time(drives: Drives, domain: Domain, victim: str) -> Figure:
 
 
 def loss_curves(drives: Drives, victim: str) -> Figure:
-    """Excess of each evaluation of the searches; the axes are shared by all victims."""
+    """The value of each evaluation of the searches, by default their excess; the axes are shared by all victims."""
     curves = [c for c in drives.curves if c.victim == victim]
-    every = np.concatenate([c.excess_m for c in drives.curves])
-    low, high = min(0.0, float(every.min())), max(0.0, float(every.max()))
+    plain = {c.plain for c in drives.curves if c.plain is not None}
+    every = np.concatenate([*(c.values for c in drives.curves), list(plain)])
+    low, high = float(every.min()), float(every.max())
     handles = []
     with new_axes() as ax:
-        ax.axhline(0.0, color=LIGHT[NONE], ls="--", lw=1.2, zorder=1)
+        for value in sorted({c.plain for c in curves if c.plain is not None}):
+            ax.axhline(value, color=LIGHT[NONE], ls="--", lw=1.2, zorder=1)
         for curve in curves:
-            x, style = np.arange(1, len(curve.excess_m) + 1), style_of(curve.method)
+            x, style = np.arange(1, len(curve.values) + 1), style_of(curve.method)
             if style.climbs:
-                ax.plot(x, curve.excess_m, color=style.light)
-                ax.plot(x[-1], curve.excess_m[-1], marker=style.marker, ms=5, color=style.light)
+                ax.plot(x, curve.values, color=style.light)
+                ax.plot(x[-1], curve.values[-1], marker=style.marker, ms=5, color=style.light)
             else:
                 dots = {"marker": style.marker, "ls": "none", "ms": 2.4, "alpha": 0.55, "mew": 0}
-                ax.plot(x, curve.excess_m, color=style.light, **dots)
-                ax.plot(x, np.maximum.accumulate(curve.excess_m), drawstyle="steps-post", color=style.light)
+                ax.plot(x, curve.values, color=style.light, **dots)
+                ax.plot(x, np.maximum.accumulate(curve.values), drawstyle="steps-post", color=style.light)
         methods = {c.method for c in curves}
         for method in sorted(methods, key=lambda name: (not style_of(name).climbs, order_of(name))):
             style = style_of(method)  # lines before dots
             text = f"{method}, one line per seed" if style.climbs else f"{method}: each texture, best so far"
             marker: Any = None if style.climbs else style.marker
             handles.append(Line2D([], [], color=style.light, label=text, marker=marker, ms=2.4))
-        handles.append(Line2D([], [], color=LIGHT[NONE], ls="--", lw=1.2, label="plain object"))
-        longest = max(len(c.excess_m) for c in drives.curves)
-        ax.set(
-            xlabel="evaluation", ylabel="excess |CTE| per tick, learned scene [m]", xlim=(0.0, longest + 1.0)
-        )
-        ax.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low) or 1.0)
+        if plain:
+            handles.append(Line2D([], [], color=LIGHT[NONE], ls="--", lw=1.2, label="plain object"))
+        longest, goal = max(len(c.values) for c in drives.curves), drives.maximised
+        what, unit = ("excess |CTE| per tick", "m") if goal is None else (goal.name, goal.unit)
+        ax.set(xlabel="evaluation", ylabel=f"{what}, learned scene [{unit}]", xlim=(0.0, longest + 1.0))
+        margin = 0.05 * (high - low)
+        ax.set_ylim(low - margin, high + margin if margin else low + 1.0)
         _legend_above(ax, handles)
     return ax.figure
 

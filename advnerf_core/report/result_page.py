@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from statistics import fmean
 from types import MappingProxyType
 from typing import Any
 
@@ -50,6 +51,9 @@ LEGEND = (
     "it is than that of the control from the same start. Intervals are nominal 95 % over searches and starts, where there are enough. Seeds, and victims, may be of several builds of scene and policies: each cell's JSON has their "
     "digests, as far as they were kept."
 )
+
+MAXIMISED = "What the searches maximised"
+_OF_SEARCHES = "The best evaluation of each search in the learned scene, from the starts of the search, mean over searches; larger is a stronger attack."
 
 
 # Cells by outcome and by the clip's file, relative to the page.
@@ -126,12 +130,71 @@ def ratios(table: ResultTable) -> str:
     )
 
 
+def maximised(table: ResultTable) -> list[dict[str, Any]]:
+    """The objectives of searches for anything but the total CTE, with their values: means over the searches of a path, victim and method.
+
+    Values are those of the best evaluation in the learned scene, from the starts of the search, in the objective's unit; ``clean_value`` is that past the
+    plain object, None where it was not kept.
+    """
+    found: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    for cell in table.cells.values():
+        if (entry := cell.extra.get("objective")) is not None:
+            found.setdefault((*cell.key, entry["name"], entry["unit"]), []).append(entry)
+    names = ("scenario", "victim", "method", "objective", "unit")
+    return [
+        {
+            **dict(zip(names, key, strict=True)),
+            "searches": len(entries),
+            **{name: _mean([entry.get(name) for entry in entries]) for name in ("value", "clean_value")},
+        }
+        for key, entries in found.items()
+    ]
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if len(known) == len(values) else None
+
+
+def maximised_table(table: ResultTable) -> Table | None:
+    """What `maximised` finds, as text; None if all searches maximised the total CTE."""
+    found = maximised(table)
+    if not found:
+        return None
+    columns = (
+        "path or variant",
+        "victim",
+        "object shows",
+        "objective",
+        "searches",
+        "value",
+        "plain object",
+        "unit",
+    )
+    rows = tuple(
+        (
+            each["scenario"],
+            each["victim"],
+            style_of(each["method"]).title,
+            each["objective"],
+            str(each["searches"]),
+            *("" if value is None else f"{value:.4g}" for value in (each["value"], each["clean_value"])),
+            each["unit"],
+        )
+        for each in found
+    )
+    right = tuple(name in ("searches", "value", "plain object") for name in columns)
+    return Table(MAXIMISED, columns, rows, right)
+
+
 def as_json(table: ResultTable, targets: Sequence[Target] = ()) -> dict[str, Any]:
-    """Lines, targets and cells as JSON-ready values."""
+    """Lines, targets and cells as JSON-ready values; ``objectives`` if searches maximised something else than the total CTE."""
+    objectives = maximised(table)
     return {
         "schema": SCHEMA,
         "name": table.name,
         "rows": [row.record() for row in table.rows],
+        **({"objectives": objectives} if objectives else {}),
         "targets": [asdict(target) for target in targets],
         "cells": {name: cell.model_dump(mode="json") for name, cell in table.cells.items()},
     }
@@ -158,6 +221,8 @@ def _field(value: Any) -> Any:
 def as_markdown(table: ResultTable, targets: Sequence[Target] = ()) -> str:
     """Lines and targets as a Markdown page."""
     parts = [f"# {table.name or 'Results'}\n", f"{LEGEND}\n", text_table(table).markdown()]
+    if (goals := maximised_table(table)) is not None:
+        parts += [f"## {MAXIMISED}\n", f"{_OF_SEARCHES}\n", goals.markdown()]
     if targets:
         parts += ["## Targets\n", target_table(targets).markdown()]
     return "\n".join(parts)
@@ -201,6 +266,8 @@ def render_page(
     parts = fragments("results.html", clips=clips, explained=_EXPLAINED)
     shown = Markup(parts.table(text_table(table).html(), LEGEND, ratios(table)))
     made = [("Results in metres", shown)]
+    if (goals := maximised_table(table)) is not None:
+        made.append((MAXIMISED, Markup(parts.table(goals.html(), _OF_SEARCHES, ""))))
     if targets:
         made.append(("Targets", Markup(parts.targets(verdict(targets), target_table(targets).html()))))
     made += [*sections, *([("Drives by outcome", Markup(parts.drives()))] if clips else [])]

@@ -98,7 +98,10 @@ def _run_figures(driven: Drives, victim: str, whole: bool) -> dict[str, Markup]:
             out[domain] = plots.svg(figure, f"Cross-track error over time, {domain}")
     if any(c.victim == victim for c in driven.curves):
         figure = plots.loss_curves(driven, victim)
-        out["curves"] = plots.svg(figure, "Excess of each evaluation of the searches over the plain object")
+        goal = driven.maximised
+        said = "Excess" if goal is None else f"{goal.name} [{goal.unit}]"
+        over = " over the plain object" * (goal is None)
+        out["curves"] = plots.svg(figure, f"{said} of each evaluation of the searches{over}")
     return out
 
 

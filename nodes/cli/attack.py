@@ -94,7 +94,8 @@ def attack_show(
         "policy": attack.policy_sha256,
         "config": attack.config_sha256,
         "software": attack.software_version,
-        **{key: str(value) for key, value in attack.extra.items()},
+        **attack.extra,
+        **({"objective": said} if (said := attack.objective_in_words) else {}),
     }.items():
         rows.add_row(name, str(value))
     print_table(rows)

@@ -133,7 +133,7 @@ def _write_and_print(
     """Table, targets and the predictions in ``folder`` to the terminal, and the page into ``output`` if it is asked for."""
     from advnerf_core.files import write_json
     from advnerf_core.report.predictions import prediction_section, prediction_table, skill_text
-    from advnerf_core.report.result_page import text_table
+    from advnerf_core.report.result_page import maximised_table, text_table
     from advnerf_core.report.targets import evaluate, target_table
     from nodes.experiment.pages.table import write_table
     from nodes.experiment.run.predictions import predicted
@@ -149,6 +149,8 @@ def _write_and_print(
             write_json(output / "predictions.json", [asdict(pair) for pair in pairs])
     console = plain_console(width=None if sys.stdout.isatty() else 200)
     console.print(text_table(full).rich())
+    if (goals := maximised_table(full)) is not None:
+        console.print(goals.rich())
     if targets:
         console.print(target_table(targets).rich())
     if pairs:

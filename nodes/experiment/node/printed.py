@@ -15,10 +15,12 @@ from advnerf_core.files import write_atomically
 
 
 def in_one_line(attack: AttackFile) -> str:
-    """The attack's total, and the policy's without it."""
+    """The attack's total, and the policy's without it; before them the value of another objective than the total."""
     total = "unknown" if attack.predicted_total_cte_m is None else f"{attack.predicted_total_cte_m:.2f} m"
     clean = "without attack not driven" if attack.clean_drive is None else attack.clean_drive.short
-    return f"attack {attack.attack_id}, {attack.method}, predicted total CTE {total}, {clean}"
+    value = attack.objective_in_words
+    said = f"{attack.method}, {value}; " if value else f"{attack.method}, "
+    return f"attack {attack.attack_id}, {said}predicted total CTE {total}, {clean}"
 
 
 def stem_of(file: Path) -> str:

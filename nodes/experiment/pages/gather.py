@@ -87,7 +87,18 @@ def _drives(
         )
     curves = [curve for cell in plan if cell.searched for curve in _curves(experiment, cell)]
     scene = _scene(experiment, scenario)
-    return rd.Drives(scenario, scene, experiment.config.dt_s, tuple(runs), tuple(curves), film, seen)
+    dt_s, goal = experiment.config.dt_s, _maximised(experiment)
+    return rd.Drives(scenario, scene, dt_s, tuple(runs), tuple(curves), film, seen, goal)
+
+
+def _maximised(experiment: Experiment) -> rd.Maximised | None:
+    """The objective that the searches maximised, by their attack files; None for the total CTE."""
+    for cell in experiment.cells:
+        if cell.searched:
+            with _of_finished(experiment, cell):
+                found = load_attack(experiment.cell_folder(cell) / ATTACK).extra.get("objective")
+            return None if found is None else rd.Maximised(found["name"], found["unit"])
+    return None
 
 
 @contextmanager
@@ -104,11 +115,16 @@ def _of_finished(experiment: Experiment, cell: Cell) -> Iterator[None]:
 
 
 def _curves(experiment: Experiment, cell: Cell) -> Iterator[rd.LossCurve]:
-    """The curve of a search over the drive without an attack from the same starts, which its attack file holds; none of older files."""
+    """The curve of a search: of the objective's values, for ``cte`` over the drive without an attack, which the attack file holds; none of older files."""
     with _of_finished(experiment, cell):
-        clean = load_attack(experiment.cell_folder(cell) / ATTACK).clean_drive
+        attack = load_attack(experiment.cell_folder(cell) / ATTACK)
         found = read_json(driven_folder(experiment, cell) / SEARCHED)
-    if clean is not None:
+    clean, goal = attack.clean_drive, attack.extra.get("objective")
+    if goal is not None:
+        if "curve_value" in found:
+            values = np.array(found["curve_value"])
+            yield rd.LossCurve(cell.method, values, cell.victim, goal.get("clean_value"))
+    elif clean is not None:
         totals_m = np.array(found["curve_total_cte_m"])
         excess_m = (totals_m - clean.mean_total_cte_m) / clean.ticks
         yield rd.LossCurve(cell.method, excess_m, cell.victim)
@@ -195,8 +211,10 @@ def _settings(experiment: Experiment) -> dict[str, str]:
         if "gradient" in config.method_names
         else ""
     )
+    goal = _maximised(experiment)
     return {
         "setting": experiment.setting,
+        **({} if goal is None else {"objective": f"{goal.name} [{goal.unit}], which the searches maximised"}),
         "searches": f"{planned_evaluations(experiment)} evaluations each, over {experiment.searched_ticks} control ticks of {config.dt_s:g} s{rates}",
         "drives": f"{config.horizon} control ticks of {config.dt_s:g} s",
         "space": ", ".join(f"{name} {value}" for name, value in config.space.model_dump().items()),

@@ -20,7 +20,7 @@ from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.data import ReportData
 from advnerf_core.report.reference import DOMAINS
-from advnerf_core.report.result_page import not_driven, text_table
+from advnerf_core.report.result_page import maximised_table, not_driven, text_table
 from advnerf_core.report.result_table import ResultTable, make_table
 from advnerf_core.report.targets import Target, evaluate, target_table
 from advnerf_core.report.text_table import count
@@ -124,6 +124,8 @@ def print_summary(experiment: Experiment, console: Console) -> None:
     )
     table, folder = table_of(experiment), experiment.stage_folder("report")
     wide.print(text_table(table).rich())
+    if (goals := maximised_table(table)) is not None:
+        wide.print(goals.rich())
     if targets := [Target(**each) for each in read_json(folder / "table.json")["targets"]]:
         wide.print(target_table(targets).rich())
     if text := not_driven(table):

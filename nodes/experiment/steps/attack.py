@@ -14,7 +14,7 @@ import torch
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
-from advnerf_core.attack.clean import clean_drive
+from advnerf_core.attack.clean import clean_drive_and_value
 from advnerf_core.attack.image_gradients import agrees_in_bfloat16
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.objectives import CTE, load_objective, objective_entry, objective_key
@@ -91,11 +91,20 @@ class Prepared:
         problem = attack_problem(self.experiment, self.space, self.policy, self.cell.scenario, seed)
         return replace(self, cell=replace(self.cell, seed=seed), problem=problem)
 
-    @cached_property
+    @property
     def clean_drive(self) -> CleanDrive:
         """The victim's drive past the plain objects, from the same starts in the same scene."""
+        return self._clean[0]
+
+    @property
+    def clean_value(self) -> float:
+        """The objective's value of that drive, mean over the starts, in its unit."""
+        return self._clean[1]
+
+    @cached_property
+    def _clean(self) -> tuple[CleanDrive, float]:
         plain = self.space.plain
-        return clean_drive(past(self.problem, self.space, plain), plain.colours)
+        return clean_drive_and_value(past(self.problem, self.space, plain), plain.colours)
 
     def require_seen(self, found: SearchResult) -> None:
         """Raise for a search whose objects are never in view: its result would look like a robust policy.
@@ -136,16 +145,18 @@ def surrogate_part(
         found: dict[str, Any] = read_json(kept)
         return found
     prepared = Prepared.of(experiment, space, cell)
-    attack_id, curve, seconds, values = None, [], 0.0, {}
+    attack_id, curve, seconds = None, [], 0.0
+    values: dict[str, Any] = {}
     if cell.searched:
         result = _search(prepared, folder, report)
         prepared.require_seen(result)
         seconds = sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
+        attack = attack_file(prepared, replace(result, theta=half_precision(result.theta)))
         if experiment.config.attack.objective != CTE:
             values = {"curve_value": [evaluation.value for evaluation in result.history]}
-        rounded = replace(result, theta=half_precision(result.theta))
-        attack_id = save_attack(folder / ATTACK, attack_file(prepared, rounded))
+            values["objective"] = attack.extra["objective"]
+        attack_id = save_attack(folder / ATTACK, attack)
     data = {
         "attack_id": attack_id,
         "policy_sha256": prepared.policy.sha256,
@@ -349,7 +360,10 @@ def attack_file(prepared: Prepared, result: SearchResult) -> AttackFile:
     if problem.disturbances is not None:
         _, found = evaluate(past(problem.undisturbed(), space, shown), shown.colours)
         entry = objective_entry(
-            experiment.config.attack.objective, problem.objective, float(found.values.mean())
+            experiment.config.attack.objective,
+            problem.objective,
+            float(found.values.mean()),
+            prepared.clean_value,
         )
         total_m = float(found.protocol_cte_m.mean())
         attack = replace(attack, predicted_total_cte_m=total_m, extra=attack.extra | entry)
@@ -371,7 +385,9 @@ def _extra(prepared: Prepared, result: SearchResult) -> dict[str, Any]:
         "start_states": problem.start_states[:, :3].tolist(),
         "searched_space": experiment.config.space.model_dump(mode="json"),
         **said_of_device(),
-        **objective_entry(experiment.config.attack.objective, problem.objective, result.best.value),
+        **objective_entry(
+            experiment.config.attack.objective, problem.objective, result.best.value, prepared.clean_value
+        ),
     }
     if identity := prepared.policy.metadata.get("not_fixed"):
         found["policy_not_fixed"] = identity

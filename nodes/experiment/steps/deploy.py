@@ -101,6 +101,7 @@ def cell_data(
             "deployed_through": experiment.config.deploy.through,
             "hardness": learned.get("hardness", ""),
             **({} if learned["attack_id"] is None else {"theta": THETA}),
+            **({"objective": learned["objective"]} if "objective" in learned else {}),
         },
     }
     if place is not None:

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from contextvars import Context, copy_context
+from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from advnerf_core.report import plots
 from advnerf_core.report.conditions import CONDITIONS, SPARE, know_methods, order_of, style_of
-from advnerf_core.report.data import LossCurve, ReportData
+from advnerf_core.report.data import LossCurve, Maximised, ReportData
 from advnerf_core.report.palette import DARK, LIGHT
 from advnerf_core.report.sections import page_sections
 
@@ -113,3 +114,18 @@ def test_a_stranger_appears_in_the_report(make):
     ]
     data = ReportData((drives,), make.manifest())
     assert any("Spiral" in body for _, body in page_sections(data, make.table([])))
+
+
+def test_searches_for_another_objective_are_drawn_and_tabled_in_its_unit(make):
+    runs = tuple(make.drive("surrogate", name, 0.1) for name in ("none", "random"))
+    curves = [LossCurve("random", np.array([-8.0, -9.0, -6.0]), plain=-7.0)]
+    drives = replace(make.drives(runs, curves), maximised=Maximised("Turn", "deg"))
+    (axes,) = plots.loss_curves(drives, "hardened").axes
+    assert axes.get_ylabel() == "Turn, learned scene [deg]"
+    plain, dots, best = (line.get_ydata() for line in axes.lines)
+    assert set(plain) == {-7.0}
+    assert list(dots) == [-8.0, -9.0, -6.0]
+    assert list(best) == [-8.0, -8.0, -6.0]
+    table = make.table([])
+    data = ReportData((drives,), make.manifest())
+    assert any("Turn [deg] of each evaluation" in body for _, body in page_sections(data, table))

@@ -96,7 +96,7 @@ def test_figures_that_are_compared_have_the_same_axes(report):
     axes = [plots.cte_over_time(drives, d, v).axes[0] for d in ("surrogate", "deployed") for v in victims]
     assert len({(ax.get_xlim(), ax.get_ylim()) for ax in axes}) == 1
     others = [
-        dataclasses.replace(curve, victim="naive", excess_m=3.0 * curve.excess_m) for curve in drives.curves
+        dataclasses.replace(curve, victim="naive", values=3.0 * curve.values) for curve in drives.curves
     ]
     both = dataclasses.replace(drives, curves=(*drives.curves, *others))
     axes = [plots.loss_curves(both, victim).axes[0] for victim in victims]

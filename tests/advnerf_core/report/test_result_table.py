@@ -13,6 +13,7 @@ from advnerf_core.report.pages import FirstScreen
 from advnerf_core.report.predictions import Predicted, prediction_section
 from advnerf_core.report.reference import Reference
 from advnerf_core.report.result_page import (
+    MAXIMISED,
     as_csv,
     as_json,
     as_markdown,
@@ -199,6 +200,27 @@ def test_json_and_page_hold_the_same_numbers(table):
     assert "4.00 × plain object" in page
     assert "missing" in page
     assert "http" not in page.replace("http-equiv", "")
+
+
+def test_what_was_maximised_is_named_with_its_values_unless_it_is_the_total(table):
+    assert "objectives" not in as_json(table)
+    assert MAXIMISED not in as_markdown(table) + render_page(table, FIRST)
+    goal = {"name": "Turn", "unit": "deg"}
+    values = ({"value": -8.0, "clean_value": -9.0}, {"value": -5.0, "clean_value": -7.0}, {"value": 1.5})
+    cells = [
+        each.model_copy(update={"extra": {**each.extra, "objective": {**goal, **value}}})
+        for each, value in zip(table.cells.values(), values, strict=True)
+    ]
+    found = make_table(WANTED, cells, "by hand")
+    two, one = as_json(found)["objectives"]
+    assert two == {
+        **{"scenario": "straight", "victim": "hardened", "method": "gradient", "searches": 2},
+        **{"objective": "Turn", "unit": "deg", "value": -6.5, "clean_value": -8.0},
+    }
+    assert (one["method"], one["value"], one["clean_value"]) == ("random", 1.5, None)
+    assert "| straight | hardened | gradient | Turn | 2 | -6.5 | -8 | deg |" in as_markdown(found)
+    page = render_page(found, FIRST)
+    assert all(text in page for text in (MAXIMISED, "Turn", "-6.5", "deg"))
 
 
 def test_clips_are_grouped_by_outcome(tmp_path):

@@ -10,6 +10,7 @@ from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.artifact import load_attack
 from nodes.experiment.node.check import check, write_check
 from nodes.experiment.node.prepare import prepare, request_text
+from nodes.experiment.node.printed import in_one_line
 from nodes.experiment.node.request import parse_request
 from nodes.experiment.node.search import run_attack
 from nodes.runtime.errors import ConfigError
@@ -35,7 +36,13 @@ def test_a_request_is_chosen_by_the_objective_of_a_file_and_reports_the_total_to
     problem = prepare(request).problem
     rollout, totals = evaluate(problem, torch.from_numpy(attack.objects[0].theta))
     left_m = problem.path.project(rollout.states[1:, :, :2].numpy()).cte_m.clip(min=0.0).sum(0)
-    assert attack.extra["objective"] == {"name": "Left", "unit": "m", "value": attack.value}
+    clean, _ = evaluate(problem, problem.sensor.plain_theta())
+    clean_m = problem.path.project(clean.states[1:, :, :2].numpy()).cte_m.clip(min=0.0).sum(0).mean()
+    entry = attack.extra["objective"]
+    assert entry == {"name": "Left", "unit": "m", "value": attack.value, "clean_value": entry["clean_value"]}
+    assert entry["clean_value"] == pytest.approx(clean_m, rel=1e-6)
+    told = f", random, Left {left_m.mean():.4g} m, without attack {clean_m:.4g} m; predicted total CTE "
+    assert told in in_one_line(attack)
     assert attack.value == pytest.approx(left_m.mean(), rel=1e-6)
     assert attack.value == max(curve["value"])
     assert attack.predicted_total_cte_m == pytest.approx(float(totals.protocol_cte_m.mean()), rel=1e-6)

@@ -7,6 +7,8 @@ import shutil
 import pytest
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.report.data import Maximised
+from nodes.experiment.pages.gather import _curves, _maximised
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import run_cell
 from nodes.experiment.run.whole import run_experiment
@@ -61,8 +63,13 @@ def test_a_cell_is_searched_for_the_objective_of_a_file_without_a_change_of_the_
     experiment = experiment_of(folder, f"{tmp_path / 'mine.py'}:Left")
     found = run_cell(experiment, RANDOM, experiment.cell_folder(RANDOM), lambda part, text="": None)
     attack = load_attack(experiment.cell_folder(RANDOM) / ATTACK)
-    curve = json.loads((experiment.cell_folder(RANDOM) / "surrogate.json").read_text())["curve_value"]
-    assert attack.extra["objective"] == {"name": "Left", "unit": "m", "value": max(curve)}
+    kept = json.loads((experiment.cell_folder(RANDOM) / "surrogate.json").read_text())
+    entry = attack.extra["objective"]
+    assert entry == {**entry, "name": "Left", "unit": "m", "value": max(kept["curve_value"])}
+    assert found["extra"]["objective"] == kept["objective"] == entry
+    (curve,) = _curves(experiment, RANDOM)
+    assert (curve.values.tolist(), curve.plain) == (kept["curve_value"], entry["clean_value"])
+    assert _maximised(experiment) == Maximised("Left", "m")
     assert found["surrogate"]["total_cte_m"][0] > 0.0
 
 
