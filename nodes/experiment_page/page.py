@@ -12,6 +12,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
+from advnerf_core.attack.objectives import CTE, load_objective
+from advnerf_core.plugins import name_in_results
 from advnerf_core.run_module import module_command
 from nodes.experiment.engine.progress_record import ProgressRecord
 from nodes.experiment.show.context import Experiment
@@ -105,6 +107,7 @@ def run_with_page(
         "setting": experiment.setting,
         "planned": planned_evaluations(experiment),
         "space": experiment.config.space.kind,
+        **_maximised(experiment.config.attack.objective),
     }
     with ExperimentPage(experiment.folder, port) as page:
         say(f"page: {page.url}")
@@ -140,3 +143,14 @@ def _serve_on(page: ExperimentPage, how: str, say: Say) -> None:
         return
     say(f"{how}; page: {page.url} (how it ran: {page.url}run); Ctrl-C ends it")
     page.wait()
+
+
+def _maximised(objective: str) -> dict[str, dict[str, str]]:
+    """Name and unit of what searches are watched by; empty for the total CTE.
+
+    Raises:
+        PluginError: The objective's code cannot be loaded.
+    """
+    if objective == CTE:
+        return {}
+    return {"maximised": {"name": name_in_results(objective), "unit": load_objective(objective).unit}}

@@ -29,19 +29,19 @@ class Search:
     """A running or finished search.
 
     Attributes:
-        totals_m: Total CTE of each evaluation [m].
+        values: The objective's value of each evaluation, in its unit; for ``cte`` the total CTE [m].
         version: Changes whenever the result changes.
         finished: Whether it has ended.
     """
 
-    totals_m: tuple[float, ...]
+    values: tuple[float, ...]
     version: str
     finished: bool
 
     @property
     def best(self) -> int:
         """Index of the best evaluation, the first of equals."""
-        return max(range(len(self.totals_m)), key=lambda index: (self.totals_m[index], -index))
+        return max(range(len(self.values)), key=lambda index: (self.values[index], -index))
 
 
 def read_search(folder: Path, state: str = STATE) -> Search | None:
@@ -60,14 +60,21 @@ def read_search(folder: Path, state: str = STATE) -> Search | None:
 @lru_cache(maxsize=512)
 def _finished(file: Path, changed_ns: int) -> tuple[float, ...]:
     del changed_ns  # a changed file is another entry of the cache
-    return tuple(round(float(each), 3) for each in read_json(file)["curve_total_cte_m"])
+    found = read_json(file)
+    return tuple(map(_rounded, found.get("curve_value", found["curve_total_cte_m"])))
 
 
 @lru_cache(maxsize=64)
 def _running(file: Path, changed_ns: int) -> tuple[float, ...]:
     del changed_ns
     history = json.loads(read_tensors(file, "numpy", ())[0]["history"])
-    return tuple(round(sum(row["protocol_cte_m"]) / len(row["protocol_cte_m"]), 3) for row in history)
+    # State files from before there were other objectives have no values.
+    each = [row.get("values", row["protocol_cte_m"]) for row in history]
+    return tuple(_rounded(sum(values) / len(values)) for values in each)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{float(value):.5g}")
 
 
 def has_texture(space: str) -> bool:

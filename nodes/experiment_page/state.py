@@ -100,7 +100,7 @@ def _searches(
 ) -> list[dict[str, Any]]:
     # Files in the folder of a waiting cell may belong to other settings.
     begun = {part["name"] for part in cells if part["state"] != "waiting"}
-    return [*_cell_searches(folder / _CELLS, record, begun), *_other_searches(folder)]
+    return [*_cell_searches(folder / _CELLS, record, begun), *_other_searches(folder, record)]
 
 
 def _cell_searches(cells_folder: Path, record: Mapping[str, Any], begun: set[str]) -> list[dict[str, Any]]:
@@ -120,14 +120,15 @@ def _title(cell: Mapping[str, Any]) -> str:
     return f"{cell['scenario']}, {cell['victim']}, {style_of(cell['method']).title}{seed}"
 
 
-def _other_searches(folder: Path) -> list[dict[str, Any]]:
+def _other_searches(folder: Path, record: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Searches against retrained victims, which belong to a stage."""
+    known = {"maximised": record["maximised"]} if "maximised" in record else {}
     found = []
     for file in sorted((folder / "retrain").glob("round*/*.state.safetensors")):
         search = read_search(file.parent, file.name)
         if search is not None:
             title = f"{file.name.partition('.')[0]}, {file.parent.name} of retraining, gradient"
-            found.append(_shown_search("", title, "gradient", search, {}))
+            found.append(_shown_search("", title, "gradient", search, known))
     return found
 
 
@@ -139,9 +140,10 @@ def _shown_search(
         "title": title,
         "colour": style_of(method).key,
         "climbs": style_of(method).climbs,
-        "planned": len(search.totals_m) if search.finished else record.get("planned", 0),
+        "planned": len(search.values) if search.finished else record.get("planned", 0),
         "finished": search.finished,
-        "totals_m": search.totals_m,
+        "values": search.values,
+        "measure": record.get("maximised", {"name": "total CTE", "unit": "m"}),
         "best": search.best,
         "texture": search.version if has_texture(record.get("space", "")) else "",
     }

@@ -26,12 +26,16 @@ def record_of(folder: Path) -> ProgressRecord:
     return record
 
 
-def search_so_far(folder: Path, totals_m: list[float], seed: int = 0) -> None:
-    """The state file of a running search, as `advnerf_core.attack.search` writes it."""
+def search_so_far(
+    folder: Path, totals_m: list[float], seed: int = 0, values: list[float] | None = None
+) -> None:
+    """The state file of a running search, as `advnerf_core.attack.search` writes it; for ``cte`` values are totals."""
     state = SearchState({})
-    for total_m in totals_m:
+    for total_m, value in zip(totals_m, values or totals_m, strict=True):
         theta = torch.from_numpy(np.random.default_rng(seed).normal(size=(8, 8, 3)).astype(np.float32))
-        state.record(theta, -total_m, Totals(*(torch.tensor([total_m]) for _ in range(4))), 0.1)
+        state.record(
+            theta, -value, Totals(*map(torch.tensor, ([total_m], [total_m], [-value], [value]))), 0.1
+        )
     folder.mkdir(parents=True, exist_ok=True)
     state.save(folder / "state.safetensors", "a fingerprint")
 

@@ -42,17 +42,19 @@ function drawTraining(card, { of, name, points }) {
 }
 
 function drawSearch(card, search) {
-  const totals = search.totals_m;
-  const each = totals.map((total, index) => [index + 1, total]);
+  const { values, measure } = search;
+  const label = `${measure.name} [${measure.unit}]`;
+  const said = (value) => `${Number(value.toPrecision(3))} ${measure.unit}`;
+  const each = values.map((value, index) => [index + 1, value]);
   let top = -Infinity;
-  const best = totals.map((total, index) => [index + 1, (top = Math.max(top, total))]);
-  const planned = Math.max(search.planned, totals.length);
-  const words = `${totals.length}${search.planned ? ` of ${search.planned}` : ""} evaluations, last ${totals[totals.length - 1].toFixed(1)} m, best ${top.toFixed(1)} m at evaluation ${search.best + 1}`;
-  const chart = plot({ points: [...each, [1, 0], [planned, 0]], xLabel: "evaluation", yLabel: "total CTE [m]", words, width: search.texture ? NARROW : WIDTH });
+  const best = values.map((value, index) => [index + 1, (top = Math.max(top, value))]);
+  const planned = Math.max(search.planned, values.length);
+  const words = `${values.length}${search.planned ? ` of ${search.planned}` : ""} evaluations, last ${said(values[values.length - 1])}, best ${said(top)} at evaluation ${search.best + 1}`;
+  const chart = plot({ points: [...each, [1, 0], [planned, 0]], xLabel: "evaluation", yLabel: label, words, width: search.texture ? NARROW : WIDTH });
   if (search.climbs) chart.line(each, "each", `--${search.colour}`);
   else chart.dots(each, `--${search.colour}`);
   chart.line(best, "line", `--${search.colour}`);
-  fill(card, search.title, chart.svg, words, ["evaluation", "total CTE [m]"], each);
+  fill(card, search.title, chart.svg, words, ["evaluation", label], each);
   if (search.texture) showTexture(card, search);
 }
 

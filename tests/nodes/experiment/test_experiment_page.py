@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 
 from advnerf_core.attack.artifact import load_attack
-from nodes.experiment.engine.progress_record import read_progress
+from nodes.experiment.engine.progress_record import ProgressRecord, read_progress
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run import whole
 from nodes.experiment_page.page import ExperimentPage, run_with_page
+from nodes.experiment_page.state import read_state
 from nodes.experiment_page.time_left import all_left_s
 from nodes.lab.recorded_victim import LABEL
 from nodes.runtime.errors import BusError
-from tests.support.experiment_page import CELLS, record_of, search_so_far, state_of
+from tests.support.experiment_page import ABOUT, CELLS, record_of, search_so_far, state_of
 from tests.support.live.page_client import request
 from tests.support.stage_versions import tiny_experiment
 
@@ -94,7 +95,7 @@ def test_the_state_follows_the_experiment(served):
     record.start(RANDOM)
     search_so_far(folder / "cells" / RANDOM, [1.0, 3.0, 2.0])
     (search,) = state_of(port)["searches"]
-    assert (search["totals_m"], search["best"], search["planned"]) == ([1.0, 3.0, 2.0], 1, 5)
+    assert (search["values"], search["best"], search["planned"]) == ([1.0, 3.0, 2.0], 1, 5)
     status, headers, png = request(port, f"/texture/{RANDOM}.png")
     assert (status, headers["content-type"]) == (200, "image/png")
     finished = {"curve_total_cte_m": [4.0, 5.0]}
@@ -110,6 +111,22 @@ def test_the_state_follows_the_experiment(served):
     assert (state["phase"], state["failure"]) == ("failed", "ValueError: no more")
     assert [part["state"] for part in state["parts"]][3] == "failed"
     assert request(port, "/")[1]["location"] == "/run"
+
+
+def test_searches_for_another_objective_are_watched_by_its_value(tmp_path):
+    cells = tmp_path / "cells"
+    record = ProgressRecord(tmp_path, {**ABOUT, "maximised": {"name": "Turn", "unit": "deg"}})
+    record.plan(["report"], CELLS)
+    for name in (RANDOM, GRADIENT):
+        record.finish(name, 0.0, cached=True)
+    search_so_far(cells / RANDOM, [1.0, 3.0, 2.0], values=[-4.0, -8.0, -2.0])
+    (cells / GRADIENT).mkdir()
+    finished = {"curve_total_cte_m": [4.0, 5.0], "curve_value": [-1.5, -7.0]}
+    (cells / GRADIENT / "surrogate.json").write_text(json.dumps(finished))
+    found = {each["name"]: each for each in read_state(tmp_path, time.time())["searches"]}
+    assert (found[RANDOM]["values"], found[RANDOM]["best"]) == ((-4.0, -8.0, -2.0), 2)
+    assert (found[GRADIENT]["values"], found[GRADIENT]["best"]) == ((-1.5, -7.0), 0)
+    assert found[RANDOM]["measure"] == {"name": "Turn", "unit": "deg"}
 
 
 def test_cells_that_other_processes_run_are_seen_by_their_files(served):
