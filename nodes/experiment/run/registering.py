@@ -29,6 +29,7 @@ from nodes.experiment.plan.carriers import FaceCarrier
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.object_kinds import PANEL
+from nodes.experiment.plan.rules import check_options
 from nodes.experiment.plan.space_config import ColoursConfig
 from nodes.experiment.run.plan import registered_cell, statuses
 from nodes.experiment.run.store import FINISHED
@@ -82,6 +83,8 @@ def _scenarios(experiment: Experiment, cells: Sequence[Cell]) -> dict[str, Regis
             variant.ask_world()
             found[cell.scenario] = registered_scenario(variant, cell.path)
     require_searchable(experiment, cells)
+    for variant in {cell.variant: experiment.of(cell) for cell in cells}.values():
+        check_options(variant.config.methods, variant.config.attack)
     return found
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from advnerf_core.attack.methods import MethodError
 from advnerf_core.files import sha256_of
 from advnerf_core.report.evidence.families import coarse_cells_differ
 from advnerf_core.report.evidence.registration import FILE, PlaceClaim, SetError, read_registration
@@ -206,6 +207,16 @@ def test_a_mesh_and_a_method_are_registered_by_their_content(tmp_path, monkeypat
     assert [cell.method for cell in cells if not registered_under(found, cell, other)] == outside
     # The key of a registration from before is that of now.
     assert registered_settings(other).key == before
+
+
+def test_an_option_that_no_method_has_is_not_registered(tmp_path):
+    (tmp_path / "mine.py").write_text(METHOD)
+    file = write_file(tmp_path)
+    mine = f"over.method=[none,{tmp_path / 'mine.py'}:Mine]"
+    wrong = load_experiment(file, "tiny", [mine, "attack.options.typo=1"], tmp_path / "run")
+    with pytest.raises(MethodError, match=r"attack\.options\.typo: .*; Mine has none"):
+        register(wrong, wrong.cells, tmp_path)
+    assert not list(tmp_path.glob("*/registration.json"))
 
 
 def test_registering_names_the_folder_that_runs_look_into(tmp_path, monkeypatch):
