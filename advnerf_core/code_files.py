@@ -14,6 +14,7 @@ import sys
 import sysconfig
 import traceback
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import EntryPoint, packages_distributions, version
 from pathlib import Path
@@ -24,6 +25,7 @@ _CACHE = "__pycache__"
 # This project's own code counts by the versions in keys, even for a plug-in beside it.
 _OURS = {"advnerf_core", "calibration", "hardware", "nodes"}
 _LARGE_BYTES = 1 << 20
+_TRIES = 5
 _OF_NO_USER = (
     *(sysconfig.get_paths()[name] + os.sep for name in ("stdlib", "purelib", "platlib")),
     *(str(Path(__file__).parents[1] / name) + os.sep for name in _OURS),
@@ -149,7 +151,7 @@ def _known_sha256(file: Path, changed_ns: int, size: int) -> str:
 def _imported(file: Path) -> set[str]:
     """Top-level names of the modules that a Python file imports; empty for a file that Python cannot parse."""
     try:
-        tree = ast.parse(file.read_bytes())
+        tree = _parsed(file.read_bytes())
     except (SyntaxError, ValueError):
         return set()  # loading it reports the error
     names = set[str]()
@@ -159,6 +161,14 @@ def _imported(file: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
             names.add(node.module.partition(".")[0])
     return names - sys.stdlib_module_names
+
+
+def _parsed(source: bytes) -> ast.Module:
+    # Before 3.13, another thread that parses while this one collects garbage makes CPython raise a SystemError: python/cpython#106905.
+    for _ in range(_TRIES):
+        with suppress(SystemError):
+            return ast.parse(source)
+    return ast.parse(source)
 
 
 def _versions(names: Iterable[str]) -> set[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import gc
 import sys
 from hashlib import sha256
 from importlib.machinery import EXTENSION_SUFFIXES
@@ -166,3 +168,27 @@ def test_an_error_of_a_users_code_names_the_line_that_called_the_library(tmp_pat
     with pytest.raises(PluginError) as refused:
         load_from_file(f"{folder / 'mine.py'}:Other", "thing")
     assert ".py:" not in in_one_line(refused.value).replace("mine.py:Other", "")
+
+
+class Parses:
+    """Garbage that parses when it is collected, as another thread may at that moment."""
+
+    def __init__(self) -> None:
+        self.me = self
+
+    def __del__(self) -> None:
+        ast.parse("x = (1 + (2 * (3 + 4)))")
+
+
+def test_a_parse_during_a_parse_is_no_fault_of_the_file(tmp_path: Path) -> None:
+    """CPython before 3.13 then raises a SystemError (python/cpython#106905)."""
+    write(tmp_path, mine=Path(code_files.__file__).read_text() + "\nimport two\n", two="x = 1\n")
+    thresholds = gc.get_threshold()
+    gc.set_threshold(50, 5, 5)
+    try:
+        for _ in range(20):
+            for _ in range(5):
+                Parses()
+            assert names(tmp_path, modules_beside(tmp_path / "mine.py")) == ["two.py"]
+    finally:
+        gc.set_threshold(*thresholds)
