@@ -107,7 +107,7 @@ def _thinned(xy: Array) -> Array:
     """Points ``[N, 2]`` every few centimetres along the trace; jitter on the spot adds no length."""
     if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < 2 or not np.isfinite(xy).all():
         raise DegenerateDataError(f"expected a trace of finite positions [N, 2], got shape {list(xy.shape)}")
-    _require_a_way(np.linalg.norm(np.diff(xy, axis=0), axis=1))
+    require_a_way(xy)
     kept = [xy[0]]
     for point in xy[1:]:
         gap = float(np.linalg.norm(point - kept[-1]))
@@ -122,12 +122,18 @@ def _thinned(xy: Array) -> Array:
     return points
 
 
-def _require_a_way(steps_m: Array) -> None:
-    """Raise for jumps between neighbouring positions [m], and for a length that no track has."""
+def require_a_way(xy: Array, closed: bool = False) -> None:
+    """Raise for jumps between neighbouring positions ``[N, 2]`` [m], of a closed way also between its ends, and for a length that no track has."""
+    steps_m = np.linalg.norm(np.diff(xy, axis=0), axis=1)
     if (jumps := steps_m[steps_m > _MOST_JUMP_M]).size:
         raise DegenerateDataError(
-            f"expected neighbouring positions within {_MOST_JUMP_M:g} m, got {jumps.size} jumps of up to {jumps.max():.2f} m: was the subject hidden, or "
-            "mistaken for another? Drive or draw the path again where all cameras see it, with positions in m"
+            f"expected neighbouring positions within {_MOST_JUMP_M:g} m, got {jumps.size} jumps of up to {jumps.max():.2f} m, the largest at "
+            f"({xy[at := int(steps_m.argmax()), 0]:.2f}, {xy[at, 1]:.2f}) m: was the subject hidden, or mistaken for another? Drive or draw it again where "
+            "all cameras see it, with positions in m"
+        )
+    if closed and (gap_m := float(np.linalg.norm(xy[-1] - xy[0]))) > _MOST_JUMP_M:
+        raise DegenerateDataError(
+            f"expected a walk that ends within {_MOST_JUMP_M:g} m of its start, got {gap_m:.2f} m: walk around all of the free floor, back to the start"
         )
     if (length_m := float(steps_m.sum())) > _MOST_LENGTH_M:
         raise DegenerateDataError(
@@ -176,14 +182,13 @@ def _pieces(points: Array, closed: bool) -> tuple[Array, list[tuple[float, float
         slope = float(np.polyfit(np.arange(end - begin) * _STEP_M, heading[begin:end], 1)[0])
         pieces.append(((end - begin) * _STEP_M, slope if abs(slope) > _STRAIGHT_1PM else 0.0))
     pieces = _merged(pieces)
-    start = np.array([*points[0], heading[0]])
+    first = 0
     if closed and len(pieces) > 1 and _alike(pieces[0][1], pieces[-1][1]):
         # The trace began in the middle of a piece: the path begins where that piece does.
         back_m = pieces[-1][0]
-        index = max(len(points) - 1 - round(back_m / _STEP_M), 0)
-        start = np.array([*points[index], heading[index]])
+        first = max(len(points) - 1 - round(back_m / _STEP_M), 0)
         pieces = [(back_m + pieces[0][0], pieces[0][1]), *pieces[1:-1]]
-    return start, pieces
+    return np.array([*points[first], wrap_angle(heading[first])]), pieces
 
 
 def _cut(heading: Array) -> list[int]:

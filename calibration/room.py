@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.driving.path import Arc, Path
-from advnerf_core.geometry import Array, invert_transform, transform_points
+from advnerf_core.geometry import Array, invert_transform, transform_points, wrap_angle
 from calibration.degeneracy import DegenerateDataError
+from calibration.path_fit import require_a_way
 from calibration.schema import TargetCalibration, measured
 
 _CELL_M = 0.01
@@ -38,9 +39,11 @@ def fence_from_trace(trace: ArrayLike, margin_m: float) -> tuple[tuple[float, fl
         margin_m: Distance of the fence inside the walk [m].
 
     Raises:
-        DegenerateDataError: The walk encloses nothing, or less than the margin.
+        DegenerateDataError: The walk jumps or does not close, so that the fence would be across floor that nobody has seen to be free; or it
+            encloses nothing, or less than the margin.
     """
     xy = _finite(trace)
+    require_a_way(xy, closed=True)
     canvas, origin = _canvas(xy, 0.2)
     pixels = _to_pixels(xy, origin)
     cv2.fillPoly(canvas, [pixels], 1)
@@ -88,8 +91,8 @@ def start_before_corner(path: Path, corner: int, before_m: float) -> tuple[float
         raise DegenerateDataError(
             f"expected {before_m:g} m of path before corner {corner}, there are {corners[corner - 1]:.2f} m"
         )
-    x, y, yaw = (round(float(value), 4) for value in path.pose_at(s % path.length_m if path.closed else s))
-    return x, y, yaw
+    x, y, yaw = path.pose_at(s % path.length_m if path.closed else s)
+    return round(float(x), 4), round(float(y), 4), round(float(wrap_angle(yaw)), 4)
 
 
 def target_of_size(

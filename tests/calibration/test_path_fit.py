@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.driving.path import Arc, Line, Path
+from advnerf_core.strict import within_a_turn
 from calibration import path_fit
 from calibration.degeneracy import DegenerateDataError
 from calibration.path_fit import fit_path
@@ -37,6 +38,18 @@ def test_the_track_comes_back_wherever_the_trace_begins(laps, start_s):
     # Closed to the path's own tolerance, or Path would have refused it; and tangents continue by construction.
     end = fit.path.pose_at(fit.path.length_m - 1e-9)
     np.testing.assert_allclose(end[:2], fit.path.pose_at(0.0)[:2], atol=1e-6)
+
+
+@pytest.mark.parametrize("turned", [1, -1])
+@pytest.mark.parametrize("start_s", 0.7 + np.linspace(0.0, SQUARE.length_m, 9)[:-1])
+def test_a_lap_begun_anywhere_in_either_direction_gives_a_path_that_a_room_may_have(start_s, turned):
+    """Its start heads within a turn: the heading along the trace goes on counting."""
+    truth = (
+        SQUARE if turned == 1 else Path.from_segments((0.0, 2.0, 0.0), 4 * [Line(1.8), Arc(1.1, -np.pi / 2)])
+    )
+    fit = fit_path(driven(truth, 1.1, start_s))
+    assert distance(fit.path, truth) < 0.01
+    assert abs(within_a_turn(fit.path.start_pose[2])) <= np.pi + 0.01
 
 
 def test_standing_still_before_and_after_changes_nothing():
@@ -94,7 +107,8 @@ def test_jumps_and_lengths_that_no_track_has_are_refused_at_once():
     hidden = trace.copy()
     hidden[50::60] += [1.0, 0.0]
     with pytest.raises(
-        DegenerateDataError, match=r"within 0\.5 m, got \d+ jumps of up to 1\.0\d m: was the subject hidden"
+        DegenerateDataError,
+        match=r"within 0\.5 m, got \d+ jumps of up to 1\.0\d m, the largest at \(.*\) m: was the subject hidden",
     ):
         fit_path(hidden)
     with pytest.raises(DegenerateDataError, match=r"at most 500 m, got 1\d\d\d m: are its positions in m"):

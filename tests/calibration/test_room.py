@@ -70,7 +70,26 @@ def test_a_fence_around_a_path_and_what_is_no_fence():
     with pytest.raises(DegenerateDataError, match="no floor is left"):
         fence_from_trace(walk(np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]])), 0.4)
     with pytest.raises(DegenerateDataError, match="at most 50 m"):
-        fence_from_trace([[0.0, 0.0], [0.0, 4000.0], [1.0, 1.0]], 0.1)
+        fence_from_trace(walk(40.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])), 0.1)
+
+
+def test_a_walk_whose_way_was_not_seen_is_no_fence():
+    """Behind the corner of an L the wand was hidden: the straight line across it goes through the wall."""
+    notched = walk(np.array([[-3, -3], [3, -3], [3, 0], [0, 0], [0, 3], [-3, 3]], float))
+    around = np.linalg.norm(notched, axis=1)
+    hidden = notched[~((around < 2.0) & (notched > -0.1).all(axis=1))]
+    with pytest.raises(
+        DegenerateDataError, match=r"1 jumps of up to 2\.8\d m, the largest at \(.*was the subject hidden"
+    ):
+        fence_from_trace(hidden, 0.3)
+    spiked = notched.copy()
+    spiked[100:150] = [-6.0, 2.0]
+    with pytest.raises(DegenerateDataError, match=r"2 jumps of up to .* mistaken for another"):
+        fence_from_trace(spiked, 0.3)
+    with pytest.raises(
+        DegenerateDataError, match=r"ends within 0\.5 m of its start, got 6\.0\d m: walk around all"
+    ):
+        fence_from_trace(notched[:-300], 0.3)
 
 
 def test_the_start_is_so_far_before_the_corner():
