@@ -141,6 +141,19 @@ def require_a_way(xy: Array, closed: bool = False) -> None:
         )
 
 
+def require_forward(xy: Array, yaw_rad: Array) -> None:
+    """Raise for a car, at positions ``[N, 2]`` [m] with headings ``[N]``, that was moved with its nose against the way."""
+    way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    at = np.searchsorted(way_m, np.arange(0.0, way_m[-1], 2.0 * _STEP_M))
+    chord = np.diff(xy[at], axis=0)
+    against = np.abs(wrap_angle(yaw_rad[at[:-1]] - np.arctan2(chord[:, 1], chord[:, 0]))) > 0.5 * np.pi
+    if len(against) and against.mean() > 0.5:
+        raise DegenerateDataError(
+            f"expected a car that drives forwards, got one whose nose points against its way on {100 * against.mean():.0f} % of it: the path would lead "
+            "the other way. Drive or push it forwards, or turn the subject's x axis forwards in Tracker"
+        )
+
+
 def _returns(points: Array, closing_m: float) -> list[int]:
     """Indices at which a trace is back at its start, heading the same way; one for each lap."""
     away = np.linalg.norm(points - points[0], axis=1)

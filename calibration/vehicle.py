@@ -45,6 +45,10 @@ _STRAIGHT_1PM = 0.12
 _MOST_STEERING_RMS_RAD = 0.02
 # A subject that is turned farther about its z axis is refused: every heading is wrong by as much [rad].
 _MOST_TURNED_RAD = math.radians(10.0)
+# A smaller offset of the subject's origin to the side is not told from the scatter of the speeds [m].
+_LEAST_LEFT_M = 0.005
+# The outermost angle may be this share of it, and this much [rad], smaller than the others' line says: more is a servo at its end.
+_END_SHARE, _END_RAD = 0.1, 0.01
 # A larger relative scatter of the speeds about the line is refused.
 _MOST_SPEED_RMS = 0.05
 
@@ -105,6 +109,7 @@ class GainsFit:
         erpm_per_mps: Electrical rpm per speed.
         erpm_offset: Electrical rpm at standstill; 0 if the speeds cannot separate it from the gain.
         origin_ahead_m: Distance of the subject's origin ahead of the rear axle [m].
+        origin_left_m: Distance of it to the left of the rear axle's middle [m]; 0 unless the speeds in circles to both sides show one.
         axis_turned_rad: Angle of the subject's x axis to the left of the direction of travel [rad].
         speed_mps: Speed of the rear axle in each segment ``[S]``.
         steering_rad: Wheel angle in each segment ``[S]``.
@@ -118,6 +123,7 @@ class GainsFit:
     erpm_per_mps: float
     erpm_offset: float
     origin_ahead_m: float
+    origin_left_m: float
     axis_turned_rad: float
     speed_mps: Array
     steering_rad: Array
@@ -130,6 +136,14 @@ class GainsFit:
     def speed_of(self, erpm: Array) -> Array:
         """Speeds of electrical rpm [m/s]."""
         return (erpm - self.erpm_offset) / self.erpm_per_mps
+
+    @property
+    def slower_in_circles(self) -> float:
+        """Share by which the car is slower in circles than on straight runs, of the speed that its command says: wheels that slip."""
+        curvature = np.abs(np.tan(self.steering_rad)) / self.wheelbase_m
+        ratio = self.speed_mps / self.speed_of(np.array([segment.erpm for segment in self.segments]))
+        straight = curvature < _STRAIGHT_1PM
+        return float(1.0 - ratio[~straight].mean() / ratio[straight].mean())
 
     @property
     def steering_rms_rad(self) -> float:
@@ -163,10 +177,11 @@ def fit_gains(drive: RecordedDrive, wheelbase_m: float) -> GainsFit:
     turned = float(np.arctan(tangent))
     _require_forward(turned)
     ahead = float(ahead_slope * np.cos(turned))
-    # Speed of the rear axle; an offset to the side cannot be separated from the gain's asymmetry and is set to 0.
-    speed = vx * np.cos(turned) - vy * np.sin(turned)
-    steering = np.arctan(wheelbase_m * w / speed)
     servo, erpm = (np.array([getattr(s, name) for s in segments]) for name in ("servo", "erpm"))
+    along = vx * np.cos(turned) - vy * np.sin(turned)
+    left = _origin_left_m(along, erpm, w)
+    speed = along + left * w  # of the rear axle's middle
+    steering = np.arctan(wheelbase_m * w / speed)
     # The servo value is exact, the angle is measured: angle over servo, then inverted.
     (slope, at_zero), (slope_sd, _) = linear_fit(np.stack([servo, np.ones_like(servo)], axis=1), steering)
     if abs(slope) < 1e-3:
@@ -186,13 +201,22 @@ def fit_gains(drive: RecordedDrive, wheelbase_m: float) -> GainsFit:
         speed_gain,
         speed_offset,
         ahead,
+        left,
         turned,
         speed,
         steering,
         stddev,
     )
+    _require_no_end_stop(servo, steering)
     _require_lines(fit)
     return fit
+
+
+def _origin_left_m(along_mps: Array, erpm: Array, yaw_rate_radps: Array) -> float:
+    """Distance of the tracked point to the left of the axle's middle [m], which in left turns is slower than the middle, and in right turns faster."""
+    rows = np.stack([erpm, np.ones_like(erpm), -yaw_rate_radps], axis=1)
+    (_, _, left), (_, _, left_sd) = linear_fit(rows, along_mps)
+    return left if abs(left) > max(3.0 * left_sd, _LEAST_LEFT_M) else 0.0
 
 
 def _require_forward(turned_rad: float) -> None:
@@ -307,6 +331,25 @@ def _speed_line(speed: Array, erpm: Array) -> tuple[float, float, float]:
             "expected the speed to follow the command, got none; is the motor on, the car on the floor?"
         )
     return 1.0 / slope, -at_zero / slope, slope_sd / slope**2
+
+
+def _require_no_end_stop(servo: Array, steering_rad: Array) -> None:
+    """Raise for wheels that the outermost servo value of a side turns less than the line through the other values says."""
+    level = np.round(servo / _SERVO_TOLERANCE)
+    for end in (level.min(), level.max()):
+        outer = level == end
+        if len(np.unique(level[~outer])) < 3:
+            continue
+        (slope, at_zero), _ = linear_fit(
+            np.stack([servo[~outer], np.ones((~outer).sum())], axis=1), steering_rad[~outer]
+        )
+        said, found = slope * float(servo[outer].mean()) + at_zero, float(steering_rad[outer].mean())
+        less = (said - found) * np.sign(said)
+        if less > max(_END_SHARE * abs(said), _END_RAD):
+            raise PoorFitError(
+                f"expected wheel angles on a line, got {found:.3f} rad at servo {servo[outer].mean():.3f}, where the other values' line says {said:.3f}: "
+                "is the servo at its end, or a wheel at its stop? Record the drive with smaller angles, and narrow servo_min and servo_max"
+            )
 
 
 def _require_lines(fit: GainsFit) -> None:

@@ -177,6 +177,7 @@ def vehicle_calibration(
         "servo_offset_stddev": gains.stddev["servo_offset"],
         "erpm_per_mps_stddev": gains.stddev["erpm_per_mps"],
         "origin_ahead_of_axle_m": gains.origin_ahead_m,
+        "origin_left_of_axle_m": gains.origin_left_m,
         "axis_turned_rad": gains.axis_turned_rad,
         "steering_delay_stddev_s": steering.delay_stddev_s,
         "steering_lag_stddev_s": steering.lag_stddev_s,
@@ -225,8 +226,17 @@ def _motion(drive: RecordedDrive, gains: GainsFit, grid: Array) -> tuple[Array, 
     """Yaw and distance of the rear axle on the grid ``[K]``."""
     yaw = np.interp(grid, drive.pose_s, drive.poses[:, 2])
     heading = yaw - gains.axis_turned_rad
-    x = np.interp(grid, drive.pose_s, drive.poses[:, 0]) - gains.origin_ahead_m * np.cos(heading)
-    y = np.interp(grid, drive.pose_s, drive.poses[:, 1]) - gains.origin_ahead_m * np.sin(heading)
+    cos, sin = np.cos(heading), np.sin(heading)
+    x = (
+        np.interp(grid, drive.pose_s, drive.poses[:, 0])
+        - gains.origin_ahead_m * cos
+        + gains.origin_left_m * sin
+    )
+    y = (
+        np.interp(grid, drive.pose_s, drive.poses[:, 1])
+        - gains.origin_ahead_m * sin
+        - gains.origin_left_m * cos
+    )
     middle = 0.5 * (heading[1:] + heading[:-1])
     steps = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle)
     return yaw, np.concatenate([[0.0], np.cumsum(steps)])

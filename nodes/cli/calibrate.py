@@ -216,7 +216,7 @@ def vehicle(
     response = fit_response(drive, gains)
     new = vehicle_calibration(gains, response, old)
     save_and_print(new, output, lambda figure: vehicle_plot(figure, gains, response))
-    g, ahead = new.gains, 1000.0 * gains.origin_ahead_m
+    g, ahead, left = new.gains, 1000.0 * gains.origin_ahead_m, 1000.0 * gains.origin_left_m
     print(
         f"servo {g.servo_per_rad:.4f} per rad, offset {g.servo_offset:.4f}; {g.erpm_per_mps:.1f} erpm per m/s"
     )
@@ -224,9 +224,19 @@ def vehicle(
         print(
             f"the subject's origin is {ahead:.0f} mm ahead of the rear axle. Move it to the rear axle in Tracker, or every cross-track error is wrong"
         )
+    if left:
+        print(
+            f"the subject's origin is {abs(left):.0f} mm to the {'left' if left > 0.0 else 'right'} of the rear axle's middle. Move it there in Tracker, "
+            "or every cross-track error is wrong by as much"
+        )
     if abs(turned := np.degrees(gains.axis_turned_rad)) > 1.0:
         print(
             f"the subject's x axis is turned by {turned:.1f} degrees to the left of the car's. Turn it in Tracker, or every heading is wrong by as much"
+        )
+    if abs(slower := gains.slower_in_circles) > 0.01:
+        print(
+            f"in circles the car is {100.0 * abs(slower):.1f} % {'slower' if slower > 0.0 else 'faster'} than on straight runs with the same command: "
+            "do its wheels slip? The speed gain is between the two, and its standard deviation does not contain this"
         )
     if new.response is not None:
         values = ", ".join(f"{key}: {value}" for key, value in new.response.attack_dynamics().items())

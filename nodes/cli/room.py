@@ -64,7 +64,7 @@ def room_path(
     from calibration.room import clearance, fence_around, start_before_corner
     from calibration.schema import RoomCalibration, measured
 
-    trace = _trace(bag, topic)
+    trace = _way(bag, topic)
     fit = fit_path(trace, closed)
     old = _old_room(output)
     if old is not None and fence_margin_m is None:
@@ -108,13 +108,14 @@ def room_fence(
     from calibration.plots import save_with_plot
     from calibration.room import clearance, fence_from_trace
     from calibration.schema import CalibrationError, RoomCalibration, measured
+    from nodes.lab.wizards.bags import read_poses
 
     old = _old_room(output)
     if old is None:
         raise CalibrationError(
             f"expected a room file at {output}, found none; fit the path first with advnerf scene room path"
         )
-    trace = _trace(bag, topic)
+    trace = read_poses(bag, topic).T[:, :2, 3]
     fence = fence_from_trace(trace, margin_m)
     least_m = clearance(old.reference_path, fence)
     _require_clearance(least_m)
@@ -253,10 +254,17 @@ def room_place(
     raise typer.Exit(FAILURE_EXIT)
 
 
-def _trace(bag: Path, topic: str) -> Array:
-    from nodes.lab.wizards.bags import read_poses
+def _way(bag: Path, topic: str) -> Array:
+    """A trace whose direction is the path's; that of the car is checked by its heading."""
+    import numpy as np
 
-    return read_poses(bag, topic).T[:, :2, 3]
+    from calibration.path_fit import require_forward
+    from nodes.lab.wizards.bags import CAR, read_poses
+
+    T = read_poses(bag, topic).T
+    if topic == CAR:
+        require_forward(T[:, :2, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0]))
+    return T[:, :2, 3]
 
 
 def _touches(bag: Path, wand: str, subject: str, tip: tuple[float, float, float]) -> Any:

@@ -5,7 +5,7 @@ from advnerf_core.driving.path import Arc, Line, Path
 from advnerf_core.strict import within_a_turn
 from calibration import path_fit
 from calibration.degeneracy import DegenerateDataError
-from calibration.path_fit import fit_path
+from calibration.path_fit import fit_path, require_forward
 
 SQUARE = Path.rounded_square(4.0, 1.1)
 
@@ -50,6 +50,14 @@ def test_a_lap_begun_anywhere_in_either_direction_gives_a_path_that_a_room_may_h
     fit = fit_path(driven(truth, 1.1, start_s))
     assert distance(fit.path, truth) < 0.01
     assert abs(within_a_turn(fit.path.start_pose[2])) <= np.pi + 0.01
+
+
+def test_a_car_that_was_pulled_backwards_gives_no_path():
+    poses = SQUARE.pose_at(np.arange(0.0, SQUARE.length_m, 0.01))
+    require_forward(poses[:, :2], poses[:, 2])
+    require_forward(poses[:, :2], poses[:, 2] + 1.2)  # a subject that is turned, or a car that drifts
+    with pytest.raises(DegenerateDataError, match="nose points against its way on 100 % of it"):
+        require_forward(poses[::-1, :2], poses[::-1, 2])
 
 
 def test_standing_still_before_and_after_changes_nothing():

@@ -11,7 +11,7 @@ from advnerf_core.driving.actuated import ActuatedAckermann
 from calibration.by_construction import twin_calibrations
 from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.schema import VehicleCalibration, load_calibration, save_calibration
-from calibration.vehicle import fit_gains, twist
+from calibration.vehicle import RecordedDrive, fit_gains, twist
 from calibration.vehicle_response import fit_response, follow, vehicle_calibration
 from hardware.worlds.lab.config import LabConfig
 from tests.support.drives import CAR, drive, program
@@ -149,6 +149,49 @@ def test_a_subject_turned_about_its_z_axis_changes_no_gain(turned_deg):
     assert gains.erpm_per_mps == pytest.approx(CAR.true_erpm_gain, rel=0.005)
     fit = fit_response(turned, gains)
     assert fit.steering.delay_s + fit.steering.lag_s == pytest.approx(0.03 + CAR.steering_lag_s, abs=0.008)
+
+
+@pytest.mark.parametrize("left_m", [0.05, -0.1])
+def test_a_subject_beside_the_middle_changes_no_gain_and_is_found(left_m):
+    """In turns to one side it is slower than the axle's middle, to the other faster."""
+    beside = drive(np.random.default_rng(0), ahead_m=0.125, left_m=left_m)
+    gains = fit_gains(beside, CAR.wheelbase_m)
+    assert gains.origin_left_m == pytest.approx(left_m, abs=0.005)
+    assert gains.origin_ahead_m == pytest.approx(0.125, abs=0.003)
+    assert gains.servo_offset == pytest.approx(CAR.true_servo_offset, abs=0.002)
+    assert gains.servo_per_rad == pytest.approx(CAR.true_servo_gain, rel=0.01)
+    assert gains.erpm_per_mps == pytest.approx(CAR.true_erpm_gain, rel=0.005)
+    fit = fit_response(beside, gains)
+    assert fit.steering.delay_s + fit.steering.lag_s == pytest.approx(0.03 + CAR.steering_lag_s, abs=0.008)
+
+
+def test_a_servo_at_its_end_is_named():
+    end = CAR.servo_from_steering(0.17)  # 0.25 is commanded
+    recorded = drive(np.random.default_rng(0), servo_ends=(end, 1.0))
+    with pytest.raises(
+        PoorFitError, match=r"where the other values' line says 0\.2\d\d: is the servo at its end"
+    ):
+        fit_gains(recorded, CAR.wheelbase_m)
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.05])
+def test_wheels_that_slip_in_circles_are_told(slip):
+    """Exact arcs, in circles slower by the share than the command says."""
+    wheelbase_m, hold_s, rate_hz = 0.25, 3.0, 100
+    pose, poses, commands = np.zeros(3), [], []
+    for speed in (0.5, 0.8):
+        for angle in (0.0, 0.25, -0.25, 0.12, -0.12):
+            true = speed * (1.0 - slip * (angle != 0.0))
+            for _ in range(round(hold_s * rate_hz)):
+                commands.append((0.5 - 1.2 * angle, 4600.0 * speed))
+                poses.append(pose.copy())
+                turn = true * math.tan(angle) / wheelbase_m / rate_hz
+                middle = pose[2] + 0.5 * turn
+                pose += [true / rate_hz * math.cos(middle), true / rate_hz * math.sin(middle), turn]
+    times = np.arange(len(poses)) / rate_hz
+    servo, erpm = np.array(commands).T
+    drive_ = RecordedDrive(times, np.array(poses), times, servo, erpm, np.full(len(times), 0.04))
+    assert fit_gains(drive_, wheelbase_m).slower_in_circles == pytest.approx(slip, abs=0.002)
 
 
 @pytest.mark.parametrize(

@@ -24,9 +24,21 @@ def program(car=CAR, speeds=(0.6, 1.0), angles=(0.0, 0.25, -0.22, 0.12, -0.12), 
 
 
 def drive(
-    rng, rows=None, car=CAR, delay_s=0.03, mocap=(0.0005, 0.001), ahead_m=0.0, turned_rad=0.0, pipeline_s=0.04
+    rng,
+    rows=None,
+    car=CAR,
+    delay_s=0.03,
+    mocap=(0.0005, 0.001),
+    ahead_m=0.0,
+    turned_rad=0.0,
+    pipeline_s=0.04,
+    left_m=0.0,
+    servo_ends=(0.0, 1.0),
 ):
-    """The commands reach the actuators ``delay_s`` after they were written; the subject's origin is ``ahead_m`` before the axle."""
+    """The commands reach the actuators ``delay_s`` after they were written; the subject's origin is ``ahead_m`` before the axle, ``left_m`` beside it.
+
+    The servo turns no farther than its ends.
+    """
     rows = program(car) if rows is None else rows
     ends = np.cumsum([row[0] for row in rows])
     command_s = np.arange(0.0, ends[-1], COMMAND_PERIOD_S)
@@ -45,12 +57,13 @@ def drive(
             state = vehicle.state
             poses.append([when, state.x_m, state.y_m, state.yaw_rad])
         elif np.isfinite(erpm[k]):
-            vehicle.command(servo=float(servo[k]), erpm=float(erpm[k]))
+            vehicle.command(servo=float(np.clip(servo[k], *servo_ends)), erpm=float(erpm[k]))
         else:
             vehicle.command(servo=float(servo[k]), brake_current_a=20.0)
     seen = np.array(poses)
     yaw = np.unwrap(seen[:, 3])
-    x, y = seen[:, 1] + ahead_m * np.cos(yaw), seen[:, 2] + ahead_m * np.sin(yaw)
+    x = seen[:, 1] + ahead_m * np.cos(yaw) - left_m * np.sin(yaw)
+    y = seen[:, 2] + ahead_m * np.sin(yaw) + left_m * np.cos(yaw)
     noisy = np.stack([x, y, yaw + turned_rad], axis=1) + rng.normal(
         0.0, [mocap[0], mocap[0], mocap[1]], (len(yaw), 3)
     )
