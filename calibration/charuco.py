@@ -14,6 +14,7 @@ from advnerf_core.geometry import Array
 from calibration.schema import CalibrationError
 
 MIN_CORNERS = 6
+_LARGEST_SQUARE_M = 1.0
 # A pose is ambiguous where the error of the first solution is above this share of the second's.
 _AMBIGUOUS = 0.6
 
@@ -43,6 +44,10 @@ class Board:
             raise CalibrationError(
                 f"expected a board of 3 x 3 squares or more with markers smaller than squares, got {self.columns} x {self.rows}, "
                 f"squares of {self.square_m} m, markers of {self.marker_m} m"
+            )
+        if self.square_m > _LARGEST_SQUARE_M:
+            raise CalibrationError(
+                f"expected squares of at most {_LARGEST_SQUARE_M:g} m, got {self.square_m:g} m; is it in mm?"
             )
         if len(self._dictionary.bytesList) < self.columns * self.rows // 2:
             raise CalibrationError(

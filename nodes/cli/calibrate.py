@@ -114,6 +114,7 @@ def intrinsics(
 ) -> None:
     """Calibrate focal length, principal point and distortion from images of a ChArUco board."""
     from calibration.charuco import BoardDetector
+    from calibration.degeneracy import DegenerateDataError
     from calibration.intrinsics import calibrate_intrinsics
     from calibration.plots import intrinsics_plot
     from calibration.schema import CalibrationError
@@ -122,7 +123,8 @@ def intrinsics(
     if model not in ("none", "two-radial", "three-radial"):
         raise CalibrationError(f"expected --model none, two-radial or three-radial; got {model!r}")
     keep_inputs(output, source)
-    detector = BoardDetector(options.board())
+    board = options.board()
+    detector = BoardDetector(board)
     views, size, seen = [], (0, 0), 0
     for index, (name, image) in enumerate(read_pictures(_source(source, live, (IMAGES,), output))):
         if size not in ((0, 0), (image.shape[1], image.shape[0])):
@@ -132,8 +134,14 @@ def intrinsics(
         size, seen = (image.shape[1], image.shape[0]), seen + 1
         if index % every == 0 and (found := detector.find(image)) is not None:
             views.append(found)
-    step = max(1, -(-len(views) // most))
-    print(f"board found in {len(views)} of {-(-seen // every)} images")
+    step, looked = max(1, -(-len(views) // most)), -(-seen // every)
+    print(f"board found in {len(views)} of {looked} images")
+    if looked >= 20 > len(views):
+        raise DegenerateDataError(
+            f"expected the board in 20 images or more, got {len(views)} of {looked}: is it one of {board.columns} x {board.rows} squares with markers of "
+            f"{board.dictionary}? Give --columns, --rows and --dictionary as it was printed, --legacy for prints of OpenCV before 4.6; else take sharper "
+            "images, nearer"
+        )
     fit = calibrate_intrinsics(views[::step], size, model)  # type: ignore[arg-type]
     save_and_print(fit.calibration, output, lambda figure: intrinsics_plot(figure, fit))
 

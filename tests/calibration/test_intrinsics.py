@@ -95,6 +95,8 @@ def test_a_drawn_board_is_detected_at_our_pixel_centres():
 def test_impossible_boards_are_refused():
     with pytest.raises(CalibrationError, match="markers smaller than squares"):
         Board(marker_m=0.2)
+    with pytest.raises(CalibrationError, match=r"squares of at most 1 m, got 125 m; is it in mm\?"):
+        Board(square_m=125.0, marker_m=94.0)
     with pytest.raises(CalibrationError, match="DICT_4X4_50 has 50"):
         Board(columns=20, rows=20)
     for dictionary in ("DICT_NONE", "ArucoDetector", "4X4_50"):

@@ -1,5 +1,6 @@
 """The commands on real bags and folders: a file with its picture, or one line that says what is wrong with the recording."""
 
+import shutil
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ import yaml
 from advnerf_core.geometry import camera_mount, make_transform, planar_pose
 from calibration.by_construction import twin_calibrations
 from calibration.charuco import Board, BoardDetector
+from calibration.degeneracy import DegenerateDataError
 from calibration.display_colour import DisplayCalibration, colours_to_show
 from calibration.measured import LensCalibration
 from calibration.schema import (
@@ -27,7 +29,7 @@ from nodes.bags.reader import read_info
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
 from nodes.cli.calibrate import app
-from nodes.lab.wizards.bags import read_shown, still_views
+from nodes.lab.wizards.bags import read_poses, read_shown, still_views
 from nodes.lab.wizards.live import record_live
 from nodes.lab.wizards.screen import show_and_watch
 from nodes.runtime.bus import Bus
@@ -109,6 +111,26 @@ def test_vehicle_from_a_bag(tmp_path, capsys):
     assert run("car", "calibrate", "time-offset", bag, "--camera", camera, "-o", tmp_path / "no.yaml") == 2
     assert "expected images on /camera/image_raw or " in capsys.readouterr().err
     assert not (tmp_path / "no.yaml").exists()
+
+
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda T: make_transform(T[:3, :3], 1000.0 * T[:3, 3]), "are they in mm"),
+        (lambda T: make_transform(Y_UP @ T[:3, :3] @ Y_UP.T, Y_UP @ T[:3, 3]), "is y up in motion capture"),
+    ],
+)
+def test_poses_in_mm_or_with_y_up_are_named(tmp_path, change, says):
+    recorded = drive(np.random.default_rng(0), program(hold_s=1.6, steps=8))
+    with BagWriter(tmp_path / "bag") as writer:
+        write_poses(
+            writer, "/vicon/car", recorded.pose_s, [change(planar_pose(*row)) for row in recorded.poses]
+        )
+    with pytest.raises(DegenerateDataError, match=says):
+        read_poses(tmp_path / "bag", "/vicon/car")
 
 
 @pytest.mark.parametrize("attached", [True, False])
@@ -211,6 +233,15 @@ def test_intrinsics_from_a_folder_then_refused_with_half_of_it(tmp_path, capsys)
     error = capsys.readouterr().err
     assert "expected at least 20 pictures with the board" in error
     assert error.count("\n") == 1
+    other = ("--columns", 6, "--rows", 8, *board[4:])
+    for file in sorted(folder.glob("*.png")):
+        for copy in range(2):  # enough pictures, but of another board
+            shutil.copy(file, folder / f"{file.stem}_{copy}.png")
+    assert run("car", "calibrate", "intrinsics", folder, *other, "-o", tmp_path / "no.yaml") == 2
+    assert (
+        "is it one of 6 x 8 squares with markers of DICT_4X4_50? Give --columns, --rows"
+        in capsys.readouterr().err
+    )
     assert (
         run(
             "car",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from calibration.schema import (
     load_calibration,
 )
 from nodes.compositor import show
-from nodes.lab.doctor.check import FAILURE, OK, CheckResult, report
+from nodes.lab.doctor.check import FAILURE, OK, WARNING, CheckResult, report
 from nodes.launching.launch_file import Plan
 
 _CURE = "run advnerf car calibrate (docs/calibration.md), or set params.calibration to the right folder"
@@ -46,6 +47,14 @@ def calibrations(plan: Plan) -> list[CheckResult]:
         oldest = min(good, key=lambda item: item[1].date)
         text = f"{', '.join(str(file) for file, _ in good)}; the oldest, {oldest[0].name}, is from {oldest[1].date}"
         rows += report("calibration", OK, text)
+        newest = max(good, key=lambda item: item[1].date)
+        if newest[1].date > datetime.date.today() + datetime.timedelta(days=1):
+            rows += report(
+                "calibration",
+                WARNING,
+                f"{newest[0]} is from {newest[1].date}, which is still to come: is the date of the file wrong, or this computer's clock?",
+                "correct it",
+            )
     return rows
 
 

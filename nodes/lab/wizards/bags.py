@@ -36,6 +36,10 @@ IMAGES, CAR, SENT = "/camera/image_raw", "/vicon/car", "/motor/sent"
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 # Poses within this time before and after a frame are checked and averaged [s].
 _HALF_WINDOW_S = 0.15
+# Motion capture, and tracks that are driven by hand, are smaller [m].
+_WIDEST_M = 1000.0
+# A car that is not on a slope nor lifted moves less up and down, than this share of its way and than this [m].
+_STEEPEST, _LIFTED_M = 0.5, 0.5
 # Largest distance of a pose from their mean [m].
 _MOST_MOTION_M = 0.004
 # Largest angle of a pose from their mean [rad].
@@ -80,7 +84,24 @@ def read_poses(bag: Path, topic: str) -> PoseSeries:
             f"expected poses on {topic} in {bag}, got {len(rows)}; was motion capture on?"
         )
     stamps = sorted(rows)
-    return PoseSeries(np.array(stamps, np.int64), np.stack([rows[stamp] for stamp in stamps]))
+    found = PoseSeries(np.array(stamps, np.int64), np.stack([rows[stamp] for stamp in stamps]))
+    _require_metres_and_z_up(found.T, bag, topic)
+    return found
+
+
+def _require_metres_and_z_up(T: Array, bag: Path, topic: str) -> None:
+    span_m = float(np.linalg.norm(np.ptp(T[:, :3, 3], axis=0)))
+    if span_m > _WIDEST_M:
+        raise DegenerateDataError(
+            f"expected positions on {topic} in {bag} within {_WIDEST_M:g} m, got {span_m:.4g} m: are they in mm? Let motion capture send metres"
+        )
+    low, high = np.percentile(T[:, :3, 3], (5, 95), axis=0)
+    x_m, y_m, z_m = high - low
+    if topic == CAR and z_m > max(_STEEPEST * max(x_m, y_m), _LIFTED_M):
+        raise DegenerateDataError(
+            f"expected a car that drives on a floor on {topic} in {bag}, got {z_m:.2f} m up and down, {x_m:.2f} m along x and {y_m:.2f} m along y: is y up "
+            "in motion capture? Set z up"
+        )
 
 
 def read_frames(bag: Path) -> Iterator[tuple[int, Rgb]]:

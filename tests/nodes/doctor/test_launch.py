@@ -21,7 +21,7 @@ from hardware.mocap.vicon import ViconConfig, free_udp_port
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.cli import main as cli
-from nodes.lab.doctor import general, graphics, launch, machine, motor
+from nodes.lab.doctor import files, general, graphics, launch, machine, motor
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, examine
 from nodes.lab.doctor.launch import checks_of, pictures_of
 from nodes.launching.launch_file import load_launch
@@ -279,6 +279,19 @@ def test_launch_check_says_which_policy_does_not_fit_the_camera(tmp_path, monkey
     with pytest.raises(typer.Exit):
         cli._refuse(cli._problems(missing))
     assert "trained for 400 x 224" in capsys.readouterr().err
+
+
+def test_a_calibration_of_the_future_is_told_and_starts(tmp_path):
+    """A small computer without a battery may have the wrong clock."""
+    shutil.copytree(TWIN, tmp_path / "twin")
+    file = tmp_path / "twin" / "vehicle.yaml"
+    file.write_text(re.sub(r"^date: .*", "date: 2999-01-01", file.read_text(), flags=re.M))
+    policy = saved_policy(tmp_path / "policy.safetensors", 336, 188)
+    plan = plan_of("green_screen", f"params.policy={policy}", f"params.calibration={tmp_path / 'twin'}")
+    rows = files.calibrations(plan)
+    assert [row.state for row in rows] == [OK, WARNING]
+    assert "vehicle.yaml is from 2999-01-01, which is still to come" in rows[1].found
+    assert files.unusable(plan) == []
 
 
 def _no_folder(folder):
