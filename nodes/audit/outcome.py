@@ -12,7 +12,7 @@ from pathlib import Path
 from advnerf_core.data.image_files import write_image
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import sha256_of, write_atomically
-from advnerf_core.policies.load import source_sha256
+from advnerf_core.policies.load import is_code, source_sha256
 from advnerf_core.report.audit_result import (
     AuditBudget,
     AuditComparison,
@@ -38,13 +38,14 @@ from nodes.audit.drives import PICTURE
 from nodes.audit.judging import Judged, film, texture_of
 from nodes.audit.kept import RESULT, keep_drives
 from nodes.audit.page import write_page
-from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, SELECTION_STARTS, AuditedQuestion
+from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, SELECTION_STARTS, VICTIM, AuditedQuestion
 from nodes.audit.schedule import NEVER_TRIED
 from nodes.audit.searching import FoundAttack, Searches
 from nodes.audit.spots import Spot
 from nodes.audit.verdict import effect_in_words
 from nodes.experiment.plan.object_kinds import extent_m, name_of
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.given import given_victim
 from nodes.runtime.progress import Report
 
 TEXTURE, BEFORE, AFTER, FILM = "object.png", "before.png", "after.png", "drives.mp4"
@@ -89,7 +90,7 @@ def result_of(known: Known, folder: Path) -> AuditResult:
     question = known.question
     return AuditResult(
         verdict=verdict_of(known),
-        policy=AuditedPolicy(path=question.given, sha256=_sha256_of(question.policy)),
+        policy=AuditedPolicy(path=question.given, sha256=_sha256_of(known)),
         place=AuditedPlace(
             name=question.place.name,
             kind=question.place.kind,
@@ -123,6 +124,7 @@ def result_of(known: Known, folder: Path) -> AuditResult:
 
 def write_result(known: Known, result: AuditResult, folder: Path, report: Report) -> str:
     """Write the result and its derived files: the drives, the film, the page; returns failed files, and why."""
+    _remove_earlier(known, folder)
     keep_drives(folder, known.judged)
     if known.best is not None:
         write_atomically(folder / ATTACK_KEPT, known.best.attack.read_bytes())
@@ -140,6 +142,15 @@ def write_result(known: Known, result: AuditResult, folder: Path, report: Report
         return "for SARIF, JUnit and OpenSCENARIO files: pip install 'advnerf[audit]', then the same command again"
     write_exports(folder, result)
     return ""
+
+
+def _remove_earlier(known: Known, folder: Path) -> None:
+    """Remove files of an earlier run in this folder that this one did not come to: they would be shown as its finding."""
+    gone = [] if known.spots else [BEFORE]
+    gone += [] if known.best is not None else [TEXTURE, AFTER, ATTACK_KEPT]
+    gone += [] if known.judged else [FILM]
+    for name in gone:
+        (folder / name).unlink(missing_ok=True)
 
 
 def verdict_of(known: Known) -> AuditVerdict:
@@ -272,8 +283,12 @@ def _budget(known: Known) -> AuditBudget:
     )
 
 
-def _sha256_of(policy: str) -> str | None:
+def _sha256_of(known: Known) -> str | None:
+    """Content hash of the policy; of code, with the versions and the answers by which it was told apart when it was looked at."""
+    policy = known.question.policy
     try:
+        if is_code(policy) and known.experiment is not None:
+            return given_victim(known.experiment, VICTIM).sha256
         return source_sha256(policy)
-    except AdvnerfError:
+    except (AdvnerfError, OSError):
         return None

@@ -27,6 +27,7 @@ class Decided(StrictModel):
         evaluations: Evaluations that the budget buys; None before they were counted.
         minutes: The budget that bought them, in minutes; None if their number itself was asked for.
         spots: Possible places of the object; None before they were chosen.
+        spots_in: Hash of the learned place that they were chosen in; empty before they were chosen.
         settings: Settings of the experiment file, by name.
     """
 
@@ -34,6 +35,7 @@ class Decided(StrictModel):
     evaluations: int | None = Field(default=None, ge=1)
     minutes: float | None = Field(default=None, gt=0.0)
     spots: list[dict[str, Any]] | None = None
+    spots_in: str = ""
     settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
 
@@ -91,19 +93,18 @@ class AuditPlan:
             )
         return planned[0], planned[1]
 
-    @property
-    def spots(self) -> list[Spot] | None:
-        """Possible places of the object; None before they were chosen."""
-        if self.decided.spots is None:
+    def spots(self, place: str) -> list[Spot] | None:
+        """Possible places of the object; None before they were chosen in the learned place of this hash."""
+        if self.decided.spots is None or self.decided.spots_in != place:
             return None
         return [
             Spot(**{**each, "placed": PlacedObject.model_validate(each["placed"])})
             for each in self.decided.spots
         ]
 
-    def choose(self, spots: list[Spot]) -> None:
-        """Store the possible places of the object."""
-        self.decide(spots=[{**vars(each), "placed": as_listed(each)} for each in spots])
+    def choose(self, spots: list[Spot], place: str) -> None:
+        """Store the possible places of the object, and the hash of the learned place that they were chosen in."""
+        self.decide(spots=[{**vars(each), "placed": as_listed(each)} for each in spots], spots_in=place)
 
     def add(self, setting: str, objects: list[dict[str, Any]], **sections: Any) -> None:
         """Add a setting with an object to the experiment file."""

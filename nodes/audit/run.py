@@ -41,7 +41,7 @@ from nodes.audit.question import (
     AuditedQuestion,
 )
 from nodes.audit.searching import FoundAttack, Searches
-from nodes.audit.spots import Spot, best_spots
+from nodes.audit.spots import Spot, best_spots, place_sha256
 from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import given_victim
@@ -185,12 +185,13 @@ class Audit:
             )
 
     def _spots(self, plan: AuditPlan, experiment: Experiment) -> list[Spot]:
-        """Possible places of the object, decided once."""
-        if plan.spots is None:
+        """Possible places of the object, decided once in this learned place."""
+        place = place_sha256(experiment)
+        if plan.spots(place) is None:
             kind, width_m = self.question.kind, footprint_m(self.question.kind)[1]
             wanted_m = self.question.size_m or _WIDTH * experiment.world.off_track_m
-            plan.choose(best_spots(experiment, kind, wanted_m / width_m, _SPOTS))
-        spots = plan.spots
+            plan.choose(best_spots(experiment, kind, wanted_m / width_m, _SPOTS), place)
+        spots = plan.spots(place)
         if not spots:
             raise CannotJudgeError(
                 "there is no spot beside the path where the object is seen; give it another --object-size, or the path another start"

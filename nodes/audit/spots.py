@@ -13,10 +13,11 @@ import numpy as np
 
 from advnerf_core.geometry import invert_transform, planar_pose
 from nodes.audit.question import OBJECT
+from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.learned_scene import load_background
+from nodes.experiment.show.learned_scene import load_background, scene_sha256
 from nodes.experiment.show.placing import SeenFrom, clean_poses, poses_beside, seen_px
 
 # In half lanes: steps along the path and away from it, and the largest distance.
@@ -61,6 +62,21 @@ def best_spots(experiment: Experiment, kind: str, scale: float, count: int) -> l
         if len(chosen) == count:
             break
     return chosen
+
+
+def place_sha256(experiment: Experiment) -> str:
+    """Hash of what `best_spots` chooses by beside the object: scene, path, lane, camera and the drive without an error."""
+    scenario = experiment.config.paths[0]
+    return hash_of(
+        [
+            scene_sha256(experiment),
+            experiment.paths[scenario].to_dict(),
+            experiment.world.off_track_m,
+            experiment.mount.tolist(),
+            vars(experiment.camera),
+            clean_poses(experiment, scenario).tolist(),
+        ]
+    )
 
 
 def _views(experiment: Experiment, scenario: str) -> list[SeenFrom]:

@@ -24,9 +24,9 @@ def verify(
         str | None,
         typer.Argument(metavar="SET", help="Name of a set, or folder of an audit.", show_default="all sets"),
     ] = None,
-    published: Annotated[
-        Path, typer.Option("--folder", help="Folder of all published sets.", exists=True, file_okay=False)
-    ] = Path("docs/results"),
+    published: Annotated[Path, typer.Option("--folder", help="Folder of all published sets.")] = Path(
+        "docs/results"
+    ),
     again: Annotated[
         int,
         typer.Option("--redrive", min=0, help="Also drive so many cells again, in the surrogate."),
@@ -48,6 +48,10 @@ def verify(
             )
         _audit(Path(name))
         return
+    if not published.is_dir():
+        raise ConfigError(
+            f"expected the folder of all published sets, or the folder of an audit as SET, got {published}, which does not exist; give --folder"
+        )
     known = sets_in(published)
     if name is not None and name not in known:
         raise SetError(

@@ -29,7 +29,7 @@ from nodes.experiment.steps.frozen import check_frozen, freeze
 from nodes.experiment.steps.keys import clean_folder, require_known, stages_needed
 from nodes.experiment.steps.live import LiveNodes
 from nodes.experiment.steps.pipeline import stages_of, stages_of_cells
-from nodes.experiment.steps.shared_search import take_search
+from nodes.experiment.steps.shared_search import drop_other_search, take_search
 from nodes.runtime.progress import Report
 
 
@@ -115,11 +115,14 @@ def search_cell(
 ) -> Path:
     """The part of `run_cell` without deployment: search and drive in the surrogate; returns the folder of the same drive without attack.
 
+    A search in ``folder`` that was made of other inputs is made anew.
+
     Raises:
         NoSuchCellError: The experiment has no such drive, victim or method.
     """
     require_known(experiment, cell)
     clean = clean_folder(experiment, cell, folder)
+    drop_other_search(experiment, cell, folder)
     freeze(experiment, cell, folder)
     with Bench(experiment) if bench is None else nullcontext(bench) as shared:
         take_search(experiment, cell.clean, clean)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 from advnerf_core.files import write_atomically
@@ -17,6 +18,13 @@ _KEY = "search_key.json"
 def search_key(experiment: Experiment, cell: Cell) -> str:
     """Hash of everything that a search, and the drives in the surrogate past its attack, depend on."""
     return cell_settings(experiment, cell, deployed=False).key
+
+
+def drop_other_search(experiment: Experiment, cell: Cell, folder: Path) -> None:
+    """Remove a cell's folder if its search was of another policy, scene, place or settings: its results are not this cell's."""
+    file = folder / _KEY
+    if file.exists() and not has_key(file, search_key(experiment, cell)):
+        shutil.rmtree(folder)
 
 
 def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:

@@ -119,6 +119,8 @@ def test_without_an_object_there_is_no_scenario(tmp_path):
     assert [file.name for file in write_exports(tmp_path, nothing)] == ["audit.sarif", "audit.junit.xml"]
     assert [file.name for file in write_exports(tmp_path, audit_result())][2:] == ["audit.xosc"]
     assert all(file.exists() for file in write_exports(tmp_path, audit_result()))
+    write_exports(tmp_path, nothing)  # the same folder, with another policy
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["audit.junit.xml", "audit.sarif"]
 
 
 SARIF_CASES = [

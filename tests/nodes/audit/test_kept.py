@@ -20,6 +20,7 @@ from nodes.audit.judging import (
 from nodes.audit.kept import DRIVES, RESULT, AuditDiffersError, KeptDrivesError, check_audit, read_drives
 from nodes.audit.verdict import effect_in_words
 from tests.support.audits import audit, audit_result
+from tests.support.commands import advnerf as command
 
 LIMIT_M, STARTS, TICKS = 0.4, 8, 20
 ENDS_M = {"object": 0.9, "object_disturbed": 0.7}
@@ -87,6 +88,16 @@ def test_an_audit_as_it_was_written_agrees_with_its_drives(folder):
     assert [line.split(": ", 1)[1] for line in check_audit(folder)] == [
         f"{evidence}, {STARTS} starts: as the drives say" for evidence in ("surrogate", "world")
     ]
+
+
+def test_the_command_verifies_an_audit_from_any_folder_and_asks_for_that_of_the_sets(
+    folder, monkeypatch, capsys
+):
+    monkeypatch.chdir(folder)  # without docs/results
+    assert command(monkeypatch, "verify", folder) == 0
+    assert "as the drives say" in capsys.readouterr().out
+    assert command(monkeypatch, "verify") == 2
+    assert "got docs/results, which does not exist; give --folder" in capsys.readouterr().err
 
 
 def last(data):

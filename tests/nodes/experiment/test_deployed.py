@@ -1,5 +1,6 @@
 """What is composed into a scene that gives colours and depth, and the drive of its own car."""
 
+import math
 from typing import Any
 
 import cv2
@@ -15,9 +16,11 @@ from advnerf_core.geometry import make_transform
 from advnerf_core.objects.voxel.model import load_object
 from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.view import PolicyView
+from hardware.worlds.world import WorldError
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DressedScene, IdealDriving, SelfDriving, drive_deployed
 from nodes.experiment.show.objects import object_file
+from tests.support.warehouse import small
 
 STRAIGHT = Path.from_segments((0.0, 0.0, 0.0), [Line(60.0)], closed=False)
 
@@ -148,3 +151,17 @@ def test_a_blocked_car_is_charged_what_it_had(make_wall: Any) -> None:
     last = abs(done.metrics.ctes_m[3])
     assert done.metrics.total_cte_m == pytest.approx(sum(map(abs, done.metrics.ctes_m[:4])) + 2 * last)
     assert done.metrics.total_cte_m < free.metrics.total_cte_m
+
+
+def test_a_command_that_is_no_number_ends_a_drive_of_a_world_with_the_reason():
+    """A world's usual clamp passes NaN on, and its car then seems to be blocked: a policy that fails would have driven well."""
+    with small().make() as world:
+        driving = SelfDriving(world, 1.0, 0.1)
+        driving.start(np.array([-5.0, 0.0, 0.0]))
+        states = driving.step(torch.tensor([[-5.0, 0.0, 0.0]]), torch.tensor([0.1]))
+        assert torch.isfinite(states).all()
+        for wrong in (math.nan, math.inf):
+            with pytest.raises(
+                WorldError, match=rf"expected a finite command from the policy, got {wrong} at tick 1"
+            ):
+                driving.step(states, torch.tensor([wrong]))

@@ -3,17 +3,24 @@
 import shutil
 
 import pytest
+import torch
 import yaml
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.documents import read_json
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import save_policy
+from advnerf_core.policies.view import PolicyView
+from calibration.schema import CameraCalibration, load_calibration
 from hardware.worlds.world import WorldError
 from nodes.experiment.node.search import run_attack
+from nodes.experiment.run.cells import search_cell
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.steps import bake
 from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
+from nodes.experiment.steps.search_files import ATTACK, FROZEN, SEARCHED
 from nodes.experiment.steps.shared_search import search_key
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.tiny_request import CALIBRATION, loaded, tiny_request
@@ -88,3 +95,29 @@ def test_a_driving_camera_outside_the_learned_box_is_refused(tmp_path):
             WorldError, match=rf"expected a driving camera in the learned box, .* got one {height_m:g} m"
         ):
             load_experiment(file, None, [f"world.camera={tmp_path / 'camera.yaml'}"], tmp_path / "run")
+
+
+def test_a_search_of_another_policy_in_the_same_folder_is_made_anew(tmp_path):
+    """An audit keeps its folder between runs, in which the policy's file may have been replaced."""
+    file = tiny_request(tmp_path, evaluations=2)
+    folder, found = tmp_path / "search", []
+    for seed in (0, 1, 1):
+        torch.manual_seed(seed)
+        camera = load_calibration(CameraCalibration, CALIBRATION / "camera.yaml")
+        save_policy(tmp_path / "policy.safetensors", PilotNet().eval(), PolicyView(camera.pinhole), {})
+        experiment = load_experiment(file, None, CHANGES, tmp_path / "run")
+        run_experiment(experiment, until="bake")
+        cell = next(each for each in experiment.cells if each.method == "gradient")
+        before = (folder / ATTACK).stat().st_mtime_ns if found else 0
+        search_cell(experiment, cell, folder, lambda *told: None)
+        frozen = read_json(folder / FROZEN)
+        found.append(
+            (
+                frozen["policy"],
+                read_json(folder / SEARCHED)["states"],
+                (folder / ATTACK).stat().st_mtime_ns != before,
+            )
+        )
+    assert found[0][0] != found[1][0] == found[2][0]
+    assert found[0][1] != found[1][1] == found[2][1]
+    assert [made for _, _, made in found] == [True, True, False]
