@@ -52,6 +52,17 @@ def line_of_a_user(error: BaseException) -> str:
     return ""
 
 
+def was_raised_by_a_user(error: BaseException) -> bool:
+    """Whether a user's code, or a library that it called, raised an error, and not this software."""
+    ours = tuple(str(Path(__file__).parents[1] / name) + os.sep for name in _OURS)
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if frame.filename.startswith(ours):
+            return False
+        if os.path.isfile(frame.filename) and not frame.filename.startswith(_OF_NO_USER):
+            return True
+    return False
+
+
 def file_sha256(file: Path) -> str:
     """Hash of a ``file.py`` and of the modules beside it that it imports; of a file that imports none, the hash of its bytes."""
     digest = hashlib.sha256(file.read_bytes())

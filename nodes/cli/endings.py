@@ -92,6 +92,12 @@ def text_for_people(error: Exception) -> str | None:
                 return f"expected {wanted.format(error.filename)}; choose another name"
     if isinstance(error, AdvnerfError | OSError):
         return str(error) or type(error).__name__
+    from advnerf_core.code_files import was_raised_by_a_user  # as most commands end without
+
+    if was_raised_by_a_user(error):
+        from advnerf_core.plugins import in_one_line
+
+        return f"your code has failed: {in_one_line(error)}; correct it, and give the same command again"
     return None
 
 

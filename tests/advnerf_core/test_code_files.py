@@ -13,7 +13,7 @@ from types import ModuleType
 import pytest
 
 from advnerf_core import code_files
-from advnerf_core.code_files import file_sha256, module_sha256, modules_beside
+from advnerf_core.code_files import file_sha256, module_sha256, modules_beside, was_raised_by_a_user
 from advnerf_core.files import sha256_of
 from advnerf_core.plugins import PluginError, code_sha256, in_one_line, load_from_file, resolve
 
@@ -168,6 +168,18 @@ def test_an_error_of_a_users_code_names_the_line_that_called_the_library(tmp_pat
     with pytest.raises(PluginError) as refused:
         load_from_file(f"{folder / 'mine.py'}:Other", "thing")
     assert ".py:" not in in_one_line(refused.value).replace("mine.py:Other", "")
+
+
+def test_whose_error_it_is_is_told_by_the_innermost_code(tmp_path: Path) -> None:
+    theirs, asked = tmp_path / "theirs.py", "import json\nfrom advnerf_core.files import sha256_of\n"
+    theirs.write_text(
+        asked
+        + "def own(): raise RuntimeError('x')\ndef library(): json.loads('{')\ndef ours(): sha256_of(None)\n"
+    )
+    for name, blamed in (("own", True), ("library", True), ("ours", False)):
+        with pytest.raises(Exception) as raised:
+            load_from_file(f"{theirs}:{name}", "code")()
+        assert was_raised_by_a_user(raised.value) is blamed
 
 
 class Parses:
