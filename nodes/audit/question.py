@@ -19,7 +19,7 @@ SELECTION_SEED, JUDGING_SEED = 10_000, 20_000
 SELECTION_STARTS = 4
 HALF, OTHER_HALF = "half", "other-half"
 # The teacher of the exported steering returns to the path within about this many half lanes.
-_RETURNS_IN = 5.0
+RETURNS_IN = 5.0
 # A small audit: fewer pictures would fail the fidelity gate, so the searches are shortened instead.
 CI_SECTIONS: Mapping[str, Any] = {"scene": {"steps": 600}}
 
@@ -113,7 +113,7 @@ def _of_photographs(question: AuditedQuestion) -> dict[str, Any]:
         **({} if held_out is None else {"capture": {"held_out": held_out}}),
         "held_cap_m": 4.0 * question.limit_m,
         "attack": {"start_sigma": min(0.1, 0.25 * question.limit_m)},
-        "policy": {"stiffness_1pm": 1.0 / (_RETURNS_IN * question.limit_m), "delay_s": 0.05},
+        "policy": {"stiffness_1pm": 1.0 / (RETURNS_IN * question.limit_m), "delay_s": 0.05},
     }
 
 

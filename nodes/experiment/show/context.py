@@ -142,12 +142,12 @@ class Experiment(ExperimentWorld):
         """Goal vector of a policy on a path; empty without a goal."""
         return self.references[scenario].goal
 
-    def expert(self, scenario: str) -> Expert:
-        """The teacher on one path; its output is the car's control: turn rate [rad/s] or wheel angle [rad]."""
+    def expert(self, scenario: str, least_stiffness_1pm: float = 0.0) -> Expert:
+        """The teacher on one path, at least so firm; its output is the car's control: turn rate [rad/s] or wheel angle [rad]."""
         wanted, car = self.config.policy, self.car
         gains = ExpertConfig(
             delay_s=wanted.delay_s,
-            stiffness_1pm=wanted.stiffness_1pm,
+            stiffness_1pm=max(wanted.stiffness_1pm, least_stiffness_1pm),
             feed_forward=wanted.feed_forward,
             smoothing_m=wanted.smoothing_m or car.speed_mps * self.config.dt_s,
         )

@@ -2,6 +2,7 @@
 
 import shutil
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -83,6 +84,24 @@ def test_a_start_outside_the_learned_box_is_refused(tmp_path):
     file = tiny_request(tmp_path)
     with pytest.raises(WorldError, match=r"expected drives that start in the learned box, .* got x = 70 m"):
         load_experiment(file, None, ["world.start=[70, 0, 0]"], tmp_path / "run")
+
+
+def test_a_teacher_may_be_firmer_than_its_file_says_and_no_softer(tmp_path):
+    """As for the steering that an audit exports, in a world whose lane the usual teacher was not made for."""
+    usual, firm = (
+        load_experiment(
+            tiny_request(tmp_path), None, [*CHANGES, f"policy.stiffness_1pm={stiffness}"], tmp_path / "run"
+        )
+        for stiffness in (0.2, 0.5)
+    )
+    states = usual.paths["track"].pose_at(np.linspace(0.1, 2.0, 5)) + [0.0, 0.2, 0.1]
+    soft, asked, wanted = (
+        teacher.steer_states(states)
+        for teacher in (usual.expert("track"), usual.expert("track", 0.5), firm.expert("track"))
+    )
+    np.testing.assert_array_equal(asked, wanted)
+    assert np.abs(asked - soft).max() > 0.02
+    np.testing.assert_array_equal(usual.expert("track", 0.1).steer_states(states), soft)
 
 
 def test_a_driving_camera_outside_the_learned_box_is_refused(tmp_path):
