@@ -94,7 +94,7 @@ def test_a_teacher_may_be_firmer_than_its_file_says_and_no_softer(tmp_path):
         )
         for stiffness in (0.2, 0.5)
     )
-    states = usual.paths["track"].pose_at(np.linspace(0.1, 2.0, 5)) + [0.0, 0.2, 0.1]
+    states = np.add(usual.paths["track"].pose_at(np.linspace(0.1, 2.0, 5)), [0.0, 0.2, 0.1])
     soft, asked, wanted = (
         teacher.steer_states(states)
         for teacher in (usual.expert("track"), usual.expert("track", 0.5), firm.expert("track"))
