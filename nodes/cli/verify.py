@@ -17,6 +17,8 @@ from nodes.runtime.terminal import fail_unless, say_error
 
 # What ``advnerf audit`` leaves in its folder.
 AUDIT = "audit.json"
+# Looked for only where sets are verified: an audit's folder may lie anywhere.
+_PUBLISHED = Path("docs/results")
 
 
 def verify(
@@ -24,9 +26,16 @@ def verify(
         str | None,
         typer.Argument(metavar="SET", help="Name of a set, or folder of an audit.", show_default="all sets"),
     ] = None,
-    published: Annotated[Path, typer.Option("--folder", help="Folder of all published sets.")] = Path(
-        "docs/results"
-    ),
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--folder",
+            help="Folder of all published sets.",
+            exists=True,
+            file_okay=False,
+            show_default=str(_PUBLISHED),
+        ),
+    ] = None,
     again: Annotated[
         int,
         typer.Option("--redrive", min=0, help="Also drive so many cells again, in the surrogate."),
@@ -48,6 +57,7 @@ def verify(
             )
         _audit(Path(name))
         return
+    published = _PUBLISHED if folder is None else folder
     if not published.is_dir():
         raise ConfigError(
             f"expected the folder of all published sets, or the folder of an audit as SET, got {published}, which does not exist; give --folder"
