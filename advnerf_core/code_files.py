@@ -26,9 +26,10 @@ _CACHE = "__pycache__"
 _OURS = {"advnerf_core", "calibration", "hardware", "nodes"}
 _LARGE_BYTES = 1 << 20
 _TRIES = 5
+_OUR_FOLDERS = tuple(str(Path(__file__).parents[1] / name) + os.sep for name in _OURS)
 _OF_NO_USER = (
     *(sysconfig.get_paths()[name] + os.sep for name in ("stdlib", "purelib", "platlib")),
-    *(str(Path(__file__).parents[1] / name) + os.sep for name in _OURS),
+    *_OUR_FOLDERS,
 )
 
 
@@ -47,20 +48,23 @@ def modules_beside(file: Path) -> list[Path]:
 def line_of_a_user(error: BaseException) -> str:
     """``file.py:line`` of the innermost call that is in neither this software nor a library; empty if there is none."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if os.path.isfile(frame.filename) and not frame.filename.startswith(_OF_NO_USER):
+        if _is_a_users(frame.filename):
             return f"{frame.filename}:{frame.lineno}"
     return ""
 
 
 def was_raised_by_a_user(error: BaseException) -> bool:
     """Whether a user's code, or a library that it called, raised an error, and not this software."""
-    ours = tuple(str(Path(__file__).parents[1] / name) + os.sep for name in _OURS)
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if frame.filename.startswith(ours):
+        if frame.filename.startswith(_OUR_FOLDERS):
             return False
-        if os.path.isfile(frame.filename) and not frame.filename.startswith(_OF_NO_USER):
+        if _is_a_users(frame.filename):
             return True
     return False
+
+
+def _is_a_users(file: str) -> bool:
+    return os.path.isfile(file) and not file.startswith(_OF_NO_USER)
 
 
 def file_sha256(file: Path) -> str:

@@ -28,7 +28,7 @@ COVERAGE_CELLS = (8, 6)  # columns, rows
 # Seen face on only, a board as twice as far away in twice the focal length looks the same.
 _LEAST_TILT_RAD, _LEAST_TILTED = np.radians(12.0), 4
 # Fewer pictures with a board are refused.
-_MIN_VIEWS = 20
+MIN_VIEWS = 20
 # A larger reprojection error is refused [px].
 _MOST_RMS_PX = 0.5
 # A smaller share of the picture's 8 x 6 cells with a corner in it is refused.
@@ -71,7 +71,7 @@ def calibrate_intrinsics(
         PoorFitError: The reprojection error is too large.
     """
     require_count(
-        len(views), _MIN_VIEWS, "pictures with the board", "take more, from all distances and angles"
+        len(views), MIN_VIEWS, "pictures with the board", "take more, from all distances and angles"
     )
     _require_coverage(_coverage(views, size))
     used = np.ones(len(views), np.bool_)
@@ -83,7 +83,7 @@ def calibrate_intrinsics(
             break
         used[np.flatnonzero(used)[~keep]] = False
         require_count(
-            int(used.sum()), _MIN_VIEWS, "sharp pictures with the board", "hold board and camera still"
+            int(used.sum()), MIN_VIEWS, "sharp pictures with the board", "hold board and camera still"
         )
     _require_tilt(fit.rotations)
     if fit.rms_px > _MOST_RMS_PX:

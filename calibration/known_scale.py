@@ -121,15 +121,16 @@ def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: 
             "expected positions in a right-handed frame with z up, got ones by which the cameras stand on their heads: are x and y exchanged "
             "(north before east), or is one of them reversed? Correct the file"
         )
-    _refuse_outlier(source, target, up, errors, [each.name for each in images])
+    _refuse_outlier(source, target, up, errors, [each.name for each in images], _OUTLIER_SHARE * spread)
     return PositionFit(similarity, len(images), rms, float(errors[worst]), images[worst].name, on_line)
 
 
-def _refuse_outlier(source: Array, target: Array, up: Array, errors: Array, names: list[str]) -> None:
+def _refuse_outlier(
+    source: Array, target: Array, up: Array, errors: Array, names: list[str], least_m: float
+) -> None:
     """Refuse a position ``[3]`` without which the others fit much better: a wrong row would tilt and scale the whole model."""
     worst = int(np.argmax(errors))
-    spread = float(np.linalg.norm(np.ptp(target, axis=0)))
-    if len(names) < _MIN_FOR_OUTLIER or errors[worst] < _OUTLIER_SHARE * spread:
+    if len(names) < _MIN_FOR_OUTLIER or errors[worst] < least_m:
         return
     others = np.arange(len(names)) != worst
     similarity, _ = fit_positions(source[others], target[others], up)

@@ -115,7 +115,7 @@ def intrinsics(
     """Calibrate focal length, principal point and distortion from images of a ChArUco board."""
     from calibration.charuco import BoardDetector
     from calibration.degeneracy import DegenerateDataError
-    from calibration.intrinsics import calibrate_intrinsics
+    from calibration.intrinsics import MIN_VIEWS, calibrate_intrinsics
     from calibration.plots import intrinsics_plot
     from calibration.schema import CalibrationError
     from nodes.lab.wizards.bags import IMAGES, read_pictures
@@ -136,9 +136,9 @@ def intrinsics(
             views.append(found)
     step, looked = max(1, -(-len(views) // most)), -(-seen // every)
     print(f"board found in {len(views)} of {looked} images")
-    if looked >= 20 > len(views):
+    if looked >= MIN_VIEWS > len(views):
         raise DegenerateDataError(
-            f"expected the board in 20 images or more, got {len(views)} of {looked}: is it one of {board.columns} x {board.rows} squares with markers of "
+            f"expected the board in {MIN_VIEWS} images or more, got {len(views)} of {looked}: is it one of {board.columns} x {board.rows} squares with markers of "
             f"{board.dictionary}? Give --columns, --rows and --dictionary as it was printed, --legacy for prints of OpenCV before 4.6; else take sharper "
             "images, nearer"
         )

@@ -65,7 +65,7 @@ def test_too_few_views_are_refused(views):
 
 
 def test_a_board_always_in_one_corner_is_refused(views, monkeypatch):
-    monkeypatch.setattr(intrinsics, "_MIN_VIEWS", 8)
+    monkeypatch.setattr(intrinsics, "MIN_VIEWS", 8)
     half = [type(v)(v.board_m[v.pixels[:, 0] < 330], v.pixels[v.pixels[:, 0] < 330]) for v in views]
     with pytest.raises(DegenerateDataError, match="at the right edge"):
         calibrate_intrinsics([v for v in half if len(v.pixels) >= 6][:25], SIZE)
