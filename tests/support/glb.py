@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from advnerf_core.geometry import Array
 from advnerf_core.objects.mesh.surface import TexturedMesh
 
-_Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_Z_UP_FROM_Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def mesh_from_glb(content: bytes) -> TexturedMesh:

@@ -1,6 +1,6 @@
 """Attacked meshes as GLB files: geometry, texture coordinates and the attacked texture, for any viewer, printer or simulator.
 
-glTF has y up; axes are converted. The texture has 8 bits a channel. Viewers light it; it was attacked unlit.
+glTF has y up and z to the front; axes are converted. The texture has 8 bits a channel. Viewers light it; it was attacked unlit.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.objects.mesh.surface import TexturedMesh
-
-_Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+from advnerf_core.objects.voxel.mesh import Z_UP_FROM_Y_UP
 
 
 def glb_bytes(mesh: TexturedMesh) -> bytes:
@@ -24,7 +23,7 @@ def glb_bytes(mesh: TexturedMesh) -> bytes:
     texels = np.ascontiguousarray(mesh.texels.reshape(-1, 2))
     keys = np.concatenate([mesh.faces.reshape(-1, 1).astype(np.float64), texels], axis=1)
     _, first, place = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    vertices = mesh.vertices[mesh.faces.reshape(-1)[first]] @ _Y_UP_FROM_Z_UP.T
+    vertices = mesh.vertices[mesh.faces.reshape(-1)[first]] @ Z_UP_FROM_Y_UP
     uv = texels[first] / [width, height]
     uv[:, 1] = 1.0 - uv[:, 1]  # trimesh counts from the bottom
     pixels = np.round(255.0 * np.clip(mesh.texture, 0.0, 1.0)).astype(np.uint8)

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array
 
-# glTF has y up; robot worlds have z up.
-_Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+# glTF has y up, z to the front and x to the left (glTF 2.0, section 3.4), as have exports with y up of most tools; a robot's world has z up, x to the
+# front and y to the left (ROS REP 103).
+Z_UP_FROM_Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+Z_UP_FROM_Y_UP.setflags(write=False)
 _SANE_SIZE = (1e-6, 1e6)
 
 
@@ -86,7 +88,7 @@ def stand(
         raise MeshError(f"expected up to be 'y' or 'z', got {up!r}")
     if height_m is not None and not (np.isfinite(height_m) and height_m > 0):
         raise MeshError(f"expected a height above zero, got {height_m}")
-    turn = _Z_UP_FROM_Y_UP if up == "y" else np.eye(3)
+    turn = Z_UP_FROM_Y_UP if up == "y" else np.eye(3)
     turned = [MeshPart(part.triangles @ turn.T, part.uv, part.texture) for part in mesh.parts]
     low, high = SurfaceMesh(tuple(turned)).box
     if not (np.isfinite(low).all() and np.isfinite(high).all()):

@@ -13,7 +13,7 @@ from advnerf_core.splats.scene_file import load_hash
 from nodes.experiment.engine.artefact import Settings
 from nodes.experiment.engine.stages import Stage
 from nodes.experiment.plan.carriers import ScreenConfig
-from nodes.experiment.plan.object_kinds import files_of, name_of
+from nodes.experiment.plan.object_kinds import files_of, is_mesh, name_of
 from nodes.experiment.plan.sections import NETWORK, UNBOUNDED, SceneConfig
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show import objects
@@ -136,8 +136,10 @@ def _bake_own(experiment: Experiment, file: Path) -> Stage:
 
 def _object(experiment: Experiment) -> Stage:
     kinds = sorted({thing.kind for thing in experiment.config.objects}, key=name_of)
+    # Objects built before the front of glTF counted have another yaw.
+    axes = {"mesh_front": "+z for y up"} if any(map(is_mesh, kinds)) else {}
     settings = Settings.of(
-        experiment.config, READS["object"], kinds=list(map(name_of, kinds)), files=files_of(kinds)
+        experiment.config, READS["object"], kinds=list(map(name_of, kinds)), files=files_of(kinds), **axes
     )
     return _stage("object", objects.run, experiment, settings)
 

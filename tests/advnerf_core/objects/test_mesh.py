@@ -54,7 +54,7 @@ def test_textures_are_embedded_and_scaled_meshes_stand_upright(tmp_path):
         return trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
 
     mesh = load_mesh(textured_box(tmp_path / "box.glb", textured), up="y", height_m=3.0)
-    np.testing.assert_allclose(mesh.size_m, [2.0, 5.0, 3.0], atol=1e-5)
+    np.testing.assert_allclose(mesh.size_m, [5.0, 2.0, 3.0], atol=1e-5)
     np.testing.assert_allclose(mesh.parts[0].texture.reshape(-1, 3)[0] * 255, [10, 200, 30], atol=0.5)
 
 

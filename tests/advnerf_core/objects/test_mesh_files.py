@@ -14,7 +14,7 @@ from PIL import Image
 from advnerf_core.objects.mesh.glb import glb_bytes
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
 from advnerf_core.objects.voxel.build import LOST, THIN, advice, build_from_mesh
-from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, part_from_colours
+from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, part_from_colours, texture_colours
 from advnerf_core.objects.voxel.mesh_files import load_mesh, read_mesh_files
 
 CASE = Path(__file__).parents[4] / "shared/data/cases/glb_up_and_colour"
@@ -76,7 +76,7 @@ def obj(folder, name="a.obj", material="map_Kd my texture.png"):
 
 def test_gltf_stands_on_its_y_and_factors_are_linear_light(tmp_path):
     mesh = load_mesh(gltf(tmp_path / "a.gltf", pbr(baseColorFactor=[0.5, 0.25, 0.0, 1.0])))
-    np.testing.assert_allclose(mesh.size_m, [1.0, 0.0, 2.0], atol=1e-6)
+    np.testing.assert_allclose(mesh.size_m, [0.0, 1.0, 2.0], atol=1e-6)
     np.testing.assert_allclose(mesh.parts[0].texture[0, 0], [0.735, 0.537, 0.0], atol=2e-3)
     np.testing.assert_allclose(load_mesh(tmp_path / "a.gltf", up="z").size_m, [1.0, 2.0, 0.0], atol=1e-6)
 
@@ -133,6 +133,23 @@ def test_a_strangers_glb_stands_and_has_its_colour():
     np.testing.assert_allclose(colour, [0.735, 0.537, 0.0], atol=3e-3)
 
 
+@pytest.mark.parametrize(("suffix", "options"), [("glb", {}), ("ply", {"up": "y", "unit": "m"})])
+def test_the_front_of_a_file_with_y_up_is_z_and_becomes_x(tmp_path, suffix, options):
+    """glTF 2.0, section 3.4: +y up, +z forward, -x right; ROS REP 103: x forward, y left, z up."""
+    marks = np.repeat(
+        np.eye(3)[[2, 0, 1]], 3, axis=0
+    )  # forward, left and up, as triangles in red, green and blue
+    corners = marks + 0.05 * np.tile(np.roll(np.eye(3), 1, axis=0), (3, 1))
+    file = tmp_path / f"marks.{suffix}"
+    colours = np.repeat(255 * np.eye(3, dtype=np.uint8), 3, axis=0)
+    trimesh.Trimesh(corners, np.arange(9).reshape(3, 3), vertex_colors=colours, process=False).export(file)
+    (part,) = load_mesh(file, **options).parts
+    middles = part.triangles.mean(axis=1)
+    rgb = texture_colours(part.texture, part.uv.mean(axis=1))
+    for axis in range(3):  # x, y and z of a robot
+        assert np.argmax(rgb[np.argmax(middles[:, axis])]) == axis
+
+
 def test_what_this_software_writes_it_reads_upright(tmp_path):
     tall = SurfaceMesh(
         tuple(
@@ -141,7 +158,11 @@ def test_what_this_software_writes_it_reads_upright(tmp_path):
         )
     )
     (tmp_path / "found.glb").write_bytes(glb_bytes(unwrapped(tall)))
-    np.testing.assert_allclose(load_mesh(tmp_path / "found.glb").size_m, tall.size_m, atol=1e-5)
+    read = load_mesh(tmp_path / "found.glb")
+    np.testing.assert_allclose(read.size_m, tall.size_m, atol=1e-5)
+    written = np.sort(np.concatenate([each.triangles.mean(axis=1) for each in tall.parts]), axis=0)
+    found = np.sort(np.concatenate([each.triangles.mean(axis=1) for each in read.parts]), axis=0)
+    np.testing.assert_allclose(found - found.mean(axis=0), written - written.mean(axis=0), atol=1e-5)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 0.001), ("cm", 0.01), ("m", 1.0), ("in", 0.0254)])
@@ -168,7 +189,7 @@ def test_a_gltf_in_millimetres_is_refused_with_the_line_to_add(tmp_path):
         MeshError, match=r"in metres, as glTF defines, got .* 1000 m; .*mm \(longest side 1 m\)"
     ):
         load_mesh(tmp_path / "box.glb")
-    np.testing.assert_allclose(load_mesh(tmp_path / "box.glb", unit="mm").size_m, [0.04, 0.1, 1.0])
+    np.testing.assert_allclose(load_mesh(tmp_path / "box.glb", unit="mm").size_m, [0.1, 0.04, 1.0])
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def result_of(folder: Path, ended: subprocess.CompletedProcess[str]) -> AuditRes
 
 
 def test_a_mesh_of_a_users_own_stands_beside_the_lane_and_is_found(folder: Path) -> None:
-    box = trimesh.creation.box((0.2, 0.5, 0.5))  # y is up
+    box = trimesh.creation.box((0.5, 0.5, 0.2))  # y is up, z to the front
     box.visual = trimesh.visual.ColorVisuals(box, vertex_colors=np.tile([120, 120, 120, 255], (8, 1)))
     box.export(folder / "crate.glb")
     ended = circle_place.audit(folder, "seduced", "--object", "crate.glb", output="mesh")

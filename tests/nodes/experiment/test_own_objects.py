@@ -30,8 +30,8 @@ STANDS = {"x_m": 12.0, "y_m": -12.0, "yaw_rad": 0.0}
 
 
 def billboard(file: Path, length_m: float = LENGTH_M) -> Path:
-    """A red box whose base is in its middle; GLB is y-up, so that its height is along y."""
-    box = trimesh.creation.box((length_m, HEIGHT_M, WIDTH_M))
+    """A red box whose base is in its middle; GLB has y up and z to the front."""
+    box = trimesh.creation.box((WIDTH_M, HEIGHT_M, length_m))
     box.visual = trimesh.visual.ColorVisuals(box, vertex_colors=np.tile([200, 20, 20, 255], (8, 1)))
     box.export(file)
     return file

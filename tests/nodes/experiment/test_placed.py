@@ -60,7 +60,7 @@ def test_the_ground_that_an_object_covers_is_that_of_its_own_size(tmp_path: Path
     file = str(tmp_path / "box.stl")
     assert covered_m(file, mesh={"unit": "mm"}, scale=2.0) == pytest.approx((0.4, 0.2))
     assert covered_m(file, mesh={"height_m": 0.8}) == pytest.approx((0.4, 0.2))
-    assert covered_m(file, mesh={"height_m": 0.8, "up": "y"}) == pytest.approx((1.6, 3.2))
+    assert covered_m(file, mesh={"height_m": 0.8, "up": "y"}) == pytest.approx((3.2, 1.6))
     assert covered_m("hydrant", mesh={"height_m": 1.5}) == pytest.approx((0.96, 0.96))
     assert covered_m("ball", mesh={"height_m": 0.35}) == pytest.approx((0.35, 0.35))
     assert covered_m("panel", face={"size_m": 0.5}, scale=2.0) == pytest.approx((0.2, 1.0))
