@@ -234,6 +234,7 @@ def _from_images(
     coarse_to_fine: bool,
     report: Report,
 ) -> ObjectModel:
+    from advnerf_core.data.epipolar import require_agreeing_poses
     from advnerf_core.objects.voxel.build import build_from_images
     from advnerf_core.objects.voxel.pictures import load_pictures
 
@@ -241,6 +242,7 @@ def _from_images(
     for remark in listed.remarks:
         print(remark)
     training, held_out = _split(listed)
+    require_agreeing_poses(training.frames, source)
     rule = "split of the data set" if listed.splits else f"every {_HELD_OUT_EVERY}th is held out"
     counts = (
         f"{len(training.frames)} training, {0 if held_out is None else len(held_out.frames)} held-out images"

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from advnerf_core.data.epipolar import require_agreeing_poses
 from advnerf_core.data.image_files import OPAQUE
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import ImageSet, PosedImages
@@ -53,6 +54,7 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     listed = load_transforms(request.transforms)
     listed.require_places()
     training, held_out = listed.training_and_held_out(request.every)
+    require_agreeing_poses(training.frames, str(request.transforms))
     for remark in listed.remarks:
         print(remark)
     images = training.load(request.size)

@@ -6,8 +6,12 @@ from collections.abc import Set
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from advnerf_core.data.epipolar import require_agreeing_poses
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import SUFFIXES, read_bytes, size_of, write_image
+from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.data.similarity import extent
 from advnerf_core.data.view_loading import read_valid
 from advnerf_core.files import write_atomically
@@ -45,6 +49,13 @@ def from_scan(path: Path, output: Path, options: ScanOptions, metric: MetricOpti
         made = {folder.resolve(), output.resolve()}
         kept, pictures = _copy_images(
             scan, path, folder, made, lambda share, text="": report(_with_reading(share), text)
+        )
+        require_agreeing_poses(
+            [
+                PosedImage(folder / each.name, each.pinhole, each.lens, np.asarray(each.T_world_from_camera))
+                for each in sorted(kept.images, key=lambda image: image.name)
+            ],
+            str(path),
         )
         similarity, facts = place(
             scan.model,

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.data.epipolar import require_agreeing_poses
 from advnerf_core.data.posed_image import PosedImage
 from advnerf_core.data.view_loading import load_image, load_view
 from advnerf_core.geometry import Array, Pinhole, camera_mount, invert_transform, make_transform
@@ -154,7 +155,7 @@ class Photographs(Undriven):
 
         Raises:
             WorldError: Too few photographs.
-            DatasetError: One photograph is there twice.
+            DatasetError: One photograph is there twice, or the poses are not those of the photographs.
         """
         self._require_no_copies()
         along = [each for each in self.along if each.mask is None]
@@ -168,6 +169,7 @@ class Photographs(Undriven):
         chosen = [along[index] for index in np.linspace(0, len(along) - 1, held_out + 2).astype(int)[1:-1]]
         left_out = {each.path.resolve() for each in chosen}
         learned = [each for each in self._all if each.path.resolve() not in left_out]
+        require_agreeing_poses(learned, self.config.images)
         if self.config.half is not None:
             learned = learned[self.config.half == "odd" :: 2]
         return [self._photograph(each, None) for each in learned], [
