@@ -27,8 +27,8 @@ _MIN_RAY_ANGLE_RAD = np.radians(2.0)
 _MAX_SIDE_SPREAD = 0.1
 # Known positions that fit worse than this share of their extent belong to something else.
 _MAX_POSITION_SHARE = 0.1
-# One position is wrong if the others fit this much better without it, by more than a share of their extent.
-_MUCH_BETTER, _MIN_FOR_OUTLIER, _OUTLIER_SHARE = 4.0, 8, 0.005
+# Positions are wrong if others fit this much better, and the worst is off by more than a share of their extent.
+_MUCH_BETTER, _MIN_TO_COMPARE, _LEAST_SHARE = 4.0, 8, 0.005
 # Up of the cameras in a world with z up; one below this is upside down.
 _UPSIDE_DOWN = -0.5
 _SHOWN = 4
@@ -98,7 +98,8 @@ def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: 
         ReconstructionError: The positions do not fit the model.
         SimilarityError: They do not fix scale and direction.
     """
-    images = [each for each in model.images if each.name in positions_m]
+    named = {each.name: each for each in model.images}
+    images = [named[name] for name in positions_m if name in named]
     if len(images) < 2:
         raise ReconstructionError(
             f"expected positions of at least 2 of the model's images, got {len(images)}; "
@@ -109,8 +110,11 @@ def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: 
     up = cameras_up(model.poses) if ground is None else ground.up
     similarity, on_line = fit_positions(source, target, up)
     errors = np.linalg.norm(similarity.points(source) - target, axis=1)
-    rms, worst = float(np.sqrt(np.mean(errors**2))), int(np.argmax(errors))
+    rms, worst = _rms(errors), int(np.argmax(errors))
     spread = float(np.linalg.norm(np.ptp(target, axis=0)))
+    compared = len(images) >= _MIN_TO_COMPARE and errors[worst] >= _LEAST_SHARE * spread
+    if compared:
+        _refuse_other_rows(source, target, up, rms)
     if rms > _MAX_POSITION_SHARE * spread:
         raise ReconstructionError(
             f"expected positions that fit the model, got distances of {rms:.3g} m (rms) over {spread:.3g} m, the largest "
@@ -121,26 +125,43 @@ def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: 
             "expected positions in a right-handed frame with z up, got ones by which the cameras stand on their heads: are x and y exchanged "
             "(north before east), or is one of them reversed? Correct the file"
         )
-    _refuse_outlier(source, target, up, errors, [each.name for each in images], _OUTLIER_SHARE * spread)
+    if compared:
+        _refuse_outlier(source, target, up, rms, [each.name for each in images], worst)
     return PositionFit(similarity, len(images), rms, float(errors[worst]), images[worst].name, on_line)
 
 
 def _refuse_outlier(
-    source: Array, target: Array, up: Array, errors: Array, names: list[str], least_m: float
+    source: Array, target: Array, up: Array, rms_m: float, names: list[str], worst: int
 ) -> None:
     """Refuse a position ``[3]`` without which the others fit much better: a wrong row would tilt and scale the whole model."""
-    worst = int(np.argmax(errors))
-    if len(names) < _MIN_FOR_OUTLIER or errors[worst] < least_m:
-        return
     others = np.arange(len(names)) != worst
     similarity, _ = fit_positions(source[others], target[others], up)
     distances = np.linalg.norm(similarity.points(source) - target, axis=1)
-    rms_m, without_m = (float(np.sqrt(np.mean(each**2))) for each in (errors, distances[others]))
+    without_m = _rms(distances[others])
     if without_m * _MUCH_BETTER < rms_m:
         raise ReconstructionError(
             f"expected positions that fit each other, got one of {names[worst]} that is {distances[worst]:.3g} m away from where the others, which fit "
             f"to {without_m:.2g} m (rms), put it; correct its row, or remove it"
         )
+
+
+def _refuse_other_rows(source: Array, target: Array, up: Array, rms_m: float) -> None:
+    """Refuse positions of which each belongs to the row before or after it: a whole track a step off fits nearly as well."""
+    for places, positions, said in (
+        (source[1:], target[:-1], "before"),
+        (source[:-1], target[1:], "after"),
+    ):
+        similarity, _ = fit_positions(places, positions, up)
+        moved_m = _rms(np.linalg.norm(similarity.points(places) - positions, axis=1))
+        if moved_m * _MUCH_BETTER < rms_m:
+            raise ReconstructionError(
+                f"expected the position of each image in its row, got positions that fit to {rms_m:.2g} m (rms), and to {moved_m:.2g} m if each image "
+                f"takes that of the row {said} it; correct the names"
+            )
+
+
+def _rms(distances_m: Array) -> float:
+    return float(np.sqrt(np.mean(distances_m**2)))
 
 
 @dataclass(frozen=True)

@@ -186,6 +186,21 @@ def test_a_wrong_row_among_known_positions_is_named(tmp_path, ring):
         run(tmp_path, *ring, positions=wrong)
 
 
+@pytest.mark.parametrize(("first", "said"), [(1, "before"), (0, "after")])
+def test_positions_of_the_row_beside_are_refused(tmp_path, first, said):
+    """On a track with nearly even steps they fit to decimetres, and the scale and the world are wrong by as much."""
+    angles = 0.25 * np.arange(10) + 0.05 * np.sin(np.arange(10))
+    places = [[8 * np.sin(a) + 0.02 * k * k, 8 - 8 * np.cos(a), 1.2] for k, a in enumerate(angles)]
+    track = [look_at(place, [place[0] + 3.0, place[1], 1.0]) for place in places]
+    images = write_images(tmp_path / "pictures", NAMES)
+    scan = write(posed([in_colmap(T) for T in track[1:9]], NAMES, floor()), tmp_path / "model")
+    run(tmp_path, scan, images, positions=write_positions(tmp_path / "gps.csv", track[1:9]))
+    (tmp_path / "out").rename(tmp_path / "right")
+    off = write_positions(tmp_path / "off.csv", track[2 * first : 2 * first + 8])
+    with pytest.raises(AdvnerfError, match=f"takes that of the row {said} it; correct the names"):
+        run(tmp_path, scan, images, positions=off)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_positions_with_the_errors_of_satellites_are_no_wrong_rows(tmp_path, ring, seed):
     noise = 0.05 * np.random.default_rng(seed).normal(size=(len(RING), 3))
