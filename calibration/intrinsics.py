@@ -27,6 +27,8 @@ _UNTIL_CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 1000, 1e-12
 COVERAGE_CELLS = (8, 6)  # columns, rows
 # Seen face on only, a board as twice as far away in twice the focal length looks the same.
 _LEAST_TILT_RAD, _LEAST_TILTED = np.radians(12.0), 4
+# Corners that all moved less show a board that stands still [px].
+_STILL_PX = 0.5
 # Fewer pictures with a board are refused.
 MIN_VIEWS = 20
 # A larger reprojection error is refused [px].
@@ -54,6 +56,26 @@ class IntrinsicsFit:
     used: NDArray[np.bool_]
     view_rms_px: Array
     errors_px: Array = field(repr=False)
+
+
+def distinct(views: Sequence[Detection]) -> list[Detection]:
+    """The views without copies, and without those in which neither board nor camera has moved since the one before.
+
+    Such views would count as many for one, and make every standard deviation too small.
+    """
+    kept, known = list[Detection](), set[bytes]()
+    for view in views:
+        corners = view.board_m.tobytes() + view.pixels.tobytes()
+        if corners not in known and not (kept and _still(kept[-1], view)):
+            kept.append(view)
+        known.add(corners)
+    return kept
+
+
+def _still(one: Detection, other: Detection) -> bool:
+    return np.array_equal(one.board_m, other.board_m) and bool(
+        np.abs(one.pixels - other.pixels).max() < _STILL_PX
+    )
 
 
 def calibrate_intrinsics(

@@ -115,7 +115,7 @@ def intrinsics(
     """Calibrate focal length, principal point and distortion from images of a ChArUco board."""
     from calibration.charuco import BoardDetector
     from calibration.degeneracy import DegenerateDataError
-    from calibration.intrinsics import MIN_VIEWS, calibrate_intrinsics
+    from calibration.intrinsics import MIN_VIEWS, calibrate_intrinsics, distinct
     from calibration.plots import intrinsics_plot
     from calibration.schema import CalibrationError
     from nodes.lab.wizards.bags import IMAGES, read_pictures
@@ -134,15 +134,17 @@ def intrinsics(
         size, seen = (image.shape[1], image.shape[0]), seen + 1
         if index % every == 0 and (found := detector.find(image)) is not None:
             views.append(found)
-    step, looked = max(1, -(-len(views) // most)), -(-seen // every)
-    print(f"board found in {len(views)} of {looked} images")
+    looked, different = -(-seen // every), distinct(views)
+    print(f"board found in {len(views)} of {looked} images", end="")
+    print("" if len(different) == len(views) else f", in {len(different)} of them at another place")
+    step = max(1, -(-len(different) // most))
     if looked >= MIN_VIEWS > len(views):
         raise DegenerateDataError(
             f"expected the board in {MIN_VIEWS} images or more, got {len(views)} of {looked}: is it one of {board.columns} x {board.rows} squares with markers of "
             f"{board.dictionary}? Give --columns, --rows and --dictionary as it was printed, --legacy for prints of OpenCV before 4.6; else take sharper "
             "images, nearer"
         )
-    fit = calibrate_intrinsics(views[::step], size, model)  # type: ignore[arg-type]
+    fit = calibrate_intrinsics(different[::step], size, model)  # type: ignore[arg-type]
     save_and_print(fit.calibration, output, lambda figure: intrinsics_plot(figure, fit))
 
 

@@ -1,5 +1,7 @@
 """A camera of known numbers is found again within what its noise allows; sets that fix none are refused with the reason."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from advnerf_core.errors import ConfigError
 from calibration import intrinsics
 from calibration.charuco import Board, BoardDetector
 from calibration.degeneracy import DegenerateDataError, PoorFitError
-from calibration.intrinsics import calibrate_intrinsics
+from calibration.intrinsics import calibrate_intrinsics, distinct
 from calibration.measured import LensCalibration
 from calibration.schema import CalibrationError, load_calibration, save_calibration
 from tests.support.boards import BOARD, board_views
@@ -46,6 +48,13 @@ def test_a_camera_that_few_tilted_pictures_fix_is_found(seed):
     found = calibrate_intrinsics([*flat, *tilted], size).calibration
     assert found.fx == pytest.approx(700.0, rel=0.02)
     assert found.rms_px < 0.2
+
+
+def test_copies_and_a_board_that_stands_still_count_once(views):
+    noise = np.random.default_rng(3).normal(0.0, 0.05, (9, *views[0].pixels.shape))
+    still = [replace(views[0], pixels=views[0].pixels + each) for each in noise]
+    assert distinct([views[0], *still, *views[1:], *views]) == views
+    assert len(distinct(views)) == len(views)
 
 
 def test_a_blurred_view_is_left_out(views):

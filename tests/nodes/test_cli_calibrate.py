@@ -235,8 +235,12 @@ def test_intrinsics_from_a_folder_then_refused_with_half_of_it(tmp_path, capsys)
     assert error.count("\n") == 1
     other = ("--columns", 6, "--rows", 8, *board[4:])
     for file in sorted(folder.glob("*.png")):
-        for copy in range(2):  # enough pictures, but of another board
+        for copy in range(2):  # enough pictures, but they show nothing new, and another board
             shutil.copy(file, folder / f"{file.stem}_{copy}.png")
+    assert run("car", "calibrate", "intrinsics", folder, *board, "-o", tmp_path / "no.yaml") == 2
+    told = capsys.readouterr()
+    assert "board found in 45 of 45 images, in 15 of them at another place" in told.out
+    assert "expected at least 20 pictures with the board" in told.err
     assert run("car", "calibrate", "intrinsics", folder, *other, "-o", tmp_path / "no.yaml") == 2
     assert (
         "is it one of 6 x 8 squares with markers of DICT_4X4_50? Give --columns, --rows"
