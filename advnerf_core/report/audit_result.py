@@ -245,9 +245,16 @@ class TriedSearch(StrictModel):
     space: Text
     method: Text
     seed: int = 0
+    setting: Text | None = Field(
+        default=None, description="Setting of the experiment file that runs it again."
+    )
     evaluations: Count
     effect_m: float | None = Field(
         description="Mean effect on the selection starts [m]; null if it was not selected from."
+    )
+    off_track: Count | None = Field(
+        default=None,
+        description="Selection starts from which the vehicle left its lane; they count before effect_m.",
     )
     selected: bool = Field(default=False, description="Whether it was driven from the judging starts.")
 
@@ -323,7 +330,15 @@ class AuditComparison(StrictModel):
 
     file: Text
     sha256: Sha256
-    effect: AuditEffect = Field(description="AuditEffect now minus effect then.")
+    past: Literal["no_object", "plain_object", "object"] | None = Field(
+        default=None,
+        description="What was driven past where the difference is largest; null in older results.",
+    )
+    effect: AuditEffect = Field(description="Largest distance from the path now, minus that then.")
+    off_track_alone: Count | None = Field(
+        default=None, description="Starts from which the vehicle leaves its lane without any object."
+    )
+    off_track_alone_then: Count | None = Field(default=None, description="The same in the earlier audit.")
     margin_m: NotNegative = Field(description="A lower end above this is worse [m].")
     starts: Annotated[int, Field(ge=2)]
 

@@ -12,9 +12,10 @@ from advnerf_core.attack.artifact import load_attack
 from advnerf_core.files import sha256_of
 from advnerf_core.geometry import wrap_angle
 from advnerf_core.report.audit_result import AuditComparison, AuditedObject, AuditResult, Evidence, read_audit
-from nodes.audit.drives import FOUND, NO_OBJECT, PLAIN_OBJECT
+from nodes.audit.drives import NO_OBJECT
+from nodes.audit.judging import comparison_of
 from nodes.audit.kept import read_drives
-from nodes.audit.verdict import ArmDrives, change_of
+from nodes.audit.verdict import ArmDrives
 from nodes.experiment.plan.object_kinds import footprint_m, name_of
 from nodes.runtime.errors import ConfigError
 
@@ -23,7 +24,6 @@ ATTACK_KEPT = "object.attack.safetensors"
 MARGIN = 0.1
 # How accurately a world puts its car down.
 _SAME_START_M, _SAME_START_RAD = 0.05, 0.1
-_ARMS = (NO_OBJECT, PLAIN_OBJECT, FOUND)
 
 
 class Before:
@@ -80,13 +80,12 @@ class Before:
             )
         then = kept.arms
         self._require_same_starts(now[NO_OBJECT], then[NO_OBJECT])
-        changes = [change_of(now[name], then[name], len(_ARMS)) for name in _ARMS]
         return AuditComparison(
             file=str(self.file),
             sha256=sha256_of(self.file),
-            effect=max(changes, key=lambda each: each.low_m),
             margin_m=MARGIN * limit_m,
             starts=self.result.starts.judging.count,
+            **comparison_of(now, then, limit_m),
         )
 
     def _require_same_starts(self, now: ArmDrives, then: ArmDrives) -> None:

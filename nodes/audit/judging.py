@@ -43,7 +43,7 @@ from nodes.audit.drives import (
     learned,
     with_starts,
 )
-from nodes.audit.verdict import ArmDrives, EffectJudgement, effect_of, judge
+from nodes.audit.verdict import ArmDrives, EffectJudgement, change_of, effect_of, judge
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.placing import clean_poses
@@ -54,7 +54,7 @@ from nodes.runtime.progress import Report
 CONTROLS: tuple[Control, ...] = ("no_object", "plain_object")
 WORLD_ARMS = (NO_OBJECT, PLAIN_OBJECT, PICTURE, FOUND)
 LEARNED_ARMS = (*WORLD_ARMS, PLAIN_DISTURBED, FOUND_DISTURBED)
-FILMED = (NO_OBJECT, PLAIN_OBJECT, FOUND)
+FILMED = COMPARED = (NO_OBJECT, PLAIN_OBJECT, FOUND)
 TITLES = {
     NO_OBJECT: "no object",
     PLAIN_OBJECT: "plain object",
@@ -166,6 +166,20 @@ def controls_of(evidence: Evidence, drives: Mapping[str, ArmDrives], limit_m: fl
         )
         for kind in get_args(ControlKind)
     ]
+
+
+def comparison_of(
+    now: Mapping[str, ArmDrives], then: Mapping[str, ArmDrives], limit_m: float
+) -> dict[str, Any]:
+    """The fields of `AuditComparison` that follow from drives of the same arms; the lane ends at a |CTE| of ``limit_m`` [m]."""
+    changes = {name: change_of(now[name], then[name], len(COMPARED)) for name in COMPARED}
+    past = max(changes, key=lambda name: changes[name].low_m)
+    return {
+        "past": past,
+        "effect": changes[past],
+        "off_track_alone": int(now[NO_OBJECT].left(limit_m).sum()),
+        "off_track_alone_then": int(then[NO_OBJECT].left(limit_m).sum()),
+    }
 
 
 def _shown_start(found: ArmDrives, control: ArmDrives) -> int:

@@ -14,24 +14,31 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Path as DrivenPath
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_atomically
+from advnerf_core.files import sha256_of, write_atomically
 from advnerf_core.geometry import Array
-from advnerf_core.report.audit_result import AuditedDrives, AuditResult, Outcome, read_audit
+from advnerf_core.report.audit_result import AuditComparison, AuditedDrives, AuditResult, Outcome, read_audit
 from hardware.worlds.paths import ReferencePath
-from nodes.audit.drives import FOUND_DISTURBED
+from nodes.audit.drives import FOUND, FOUND_DISTURBED
 from nodes.audit.judging import (
+    COMPARED,
     LEARNED_ARMS,
     WORLD_ARMS,
     Judged,
+    comparison_of,
     controls_of,
     disturbed_numbers_of,
     judgement_of,
     numbers_of,
 )
-from nodes.audit.verdict import ArmDrives, EffectJudgement, effect_in_words
+from nodes.audit.sentence import sentence_of
+from nodes.audit.verdict import ArmDrives, EffectJudgement
+from nodes.experiment.show.context import Experiment
 from nodes.lab.worlds.expert_drive import as_path
 
 DRIVES, RESULT = "drives.json", "audit.json"
+# Drives from the starts of an earlier audit, beside the judged ones.
+_NOW, _THEN = "against", "against_then"
+_ARMS = {"surrogate": LEARNED_ARMS, "world": WORLD_ARMS, _NOW: COMPARED, _THEN: COMPARED}
 # Numbers must agree to this [m]: they come from the same states.
 _SAME_M = 1e-6
 
@@ -44,21 +51,28 @@ class KeptDrivesError(AdvnerfError, ValueError):
     """The drives that an audit kept cannot be read."""
 
 
-def keep_drives(folder: Path, judged: Sequence[Judged]) -> None:
-    """Write the states of all judged drives, with their path and horizon."""
-    data = {each.evidence: _as_data(each) for each in judged}
-    write_atomically(folder / DRIVES, json.dumps(data) + "\n")
+def keep_drives(folder: Path, judged: Sequence[Judged], compared: Mapping[str, Any]) -> None:
+    """Write the states of all judged drives, with their path and horizon, and those of `compared_drives`."""
+    data = {each.evidence: _as_data(each.experiment, each.drives, each.limit_m) for each in judged}
+    write_atomically(folder / DRIVES, json.dumps({**data, **compared}) + "\n")
 
 
-def _as_data(judged: Judged) -> dict[str, Any]:
-    experiment = judged.experiment
+def compared_drives(
+    experiment: Experiment, now: Mapping[str, ArmDrives], limit_m: float, earlier: Path, evidence: str
+) -> dict[str, Any]:
+    """Drives from the starts of an earlier audit, now and as kept in its folder then, for `keep_drives`."""
+    then = read_json(earlier / DRIVES)[evidence]
+    return {_NOW: _as_data(experiment, now, limit_m), _THEN: then}
+
+
+def _as_data(experiment: Experiment, drives: Mapping[str, ArmDrives], limit_m: float) -> dict[str, Any]:
     limits = experiment.limits
     return {
         "path": experiment.references[experiment.config.paths[0]].to_dict(),
         "limits": {"ticks": limits.ticks, "dt_s": limits.dt_s, "held_cap_m": limits.held_cap_m},
-        "off_track_m": judged.limit_m,
-        "states": {name: drives.states.tolist() for name, drives in judged.drives.items()},
-        "driven_ticks": {name: drives.driven_ticks.tolist() for name, drives in judged.drives.items()},
+        "off_track_m": limit_m,
+        "states": {name: each.states.tolist() for name, each in drives.items()},
+        "driven_ticks": {name: each.driven_ticks.tolist() for name, each in drives.items()},
     }
 
 
@@ -76,7 +90,7 @@ class KeptDrives:
 
 
 def read_drives(folder: Path) -> dict[str, KeptDrives]:
-    """The judged drives by evidence, measured again.
+    """The judged drives by evidence, measured again, and those that were compared with an earlier audit's.
 
     Raises:
         KeptDrivesError: The file does not hold drives as `keep_drives` writes them.
@@ -96,7 +110,7 @@ def _measured(evidence: str, data: Mapping[str, Any]) -> KeptDrives:
     horizon = Horizon(off_track_m=data["off_track_m"], **data["limits"])
     arms = {
         name: _arm(path, horizon, np.array(data["states"][name], np.float64), data["driven_ticks"][name])
-        for name in (LEARNED_ARMS if evidence == "surrogate" else WORLD_ARMS)
+        for name in _ARMS[evidence]
     }
     shapes = {each.states.shape for each in arms.values()}
     if len(shapes) != 1 or not all(shapes.copy().pop()):
@@ -113,22 +127,28 @@ def _arm(path: DrivenPath, horizon: Horizon, states: Array, driven_ticks: Sequen
 
 
 def check_audit(folder: Path) -> list[str]:
-    """Recompute an audit's numbers from the drives in its folder; returns the checks, a line each.
+    """Recompute an audit's numbers from the drives in its folder, and its verdict; returns the checks, a line each.
 
     Raises:
-        AuditDiffersError: A number differs, or drives of another audit are kept.
+        AuditDiffersError: A number differs, drives of another audit are kept, or a file of the folder is missing or another.
         KeptDrivesError: The kept drives cannot be read.
     """
     result = read_audit(folder / RESULT)
     judgements = () if result.strongest is None else result.strongest.judgements
-    drives = read_drives(folder) if judgements or (folder / DRIVES).exists() else {}
+    drives = read_drives(folder) if (folder / DRIVES).exists() or judgements else {}
+    compared = {name: drives.pop(name) for name in (_NOW, _THEN) if name in drives}
     _same(folder, "judged evidence", [each.evidence for each in judgements], list(drives))
-    if not judgements:
-        return [f"{folder}: {result.verdict.outcome}, nothing was judged"]
     lines = [_check(folder, result, each, drives[each.evidence]) for each in judgements]
-    last = drives[judgements[-1].evidence]
-    _check_verdict(folder, result, judgement_of(last.arms, last.horizon.off_track_m))
-    return lines
+    if result.against is not None and result.against.past is not None:
+        lines.append(_check_comparison(folder, result.against, compared))
+    _check_files(folder, result)
+    _check_searches(folder, result)
+    if judgements:
+        last = drives[judgements[-1].evidence]
+        _check_outcome(folder, result, judgement_of(last.arms, last.horizon.off_track_m))
+    verdict = result.verdict
+    _same(folder, "verdict.sentence", verdict.sentence, sentence_of(result, verdict.outcome, verdict.reasons))
+    return lines or [f"{folder}: {verdict.outcome}, nothing was judged"]
 
 
 def _check(folder: Path, result: AuditResult, said: AuditedDrives, kept: KeptDrives) -> str:
@@ -148,15 +168,48 @@ def _check(folder: Path, result: AuditResult, said: AuditedDrives, kept: KeptDri
     return f"{folder}: {said.evidence}, {len(said.starts)} starts: as the drives say"
 
 
-def _check_verdict(folder: Path, result: AuditResult, judged: EffectJudgement) -> None:
-    """Whether the verdict is that of the last judged drives, which is the strongest evidence, and its sentence has their numbers."""
+def _check_comparison(folder: Path, said: AuditComparison, drives: Mapping[str, KeptDrives]) -> str:
+    _same(folder, "compared drives", [_NOW, _THEN], list(drives))
+    now, then = drives[_NOW], drives[_THEN]
+    again = comparison_of(now.arms, then.arms, now.horizon.off_track_m)
+    _same(folder, "against", said.model_dump(), said.model_copy(update=again).model_dump())
+    _same(folder, "against.starts", said.starts, len(now.arms[FOUND].states))
+    return f"{folder}: against {said.file}, {said.starts} starts: as the drives say"
+
+
+def _check_files(folder: Path, result: AuditResult) -> None:
+    """Whether the question and the texture are those that the result names."""
+    named = {result.question.file: result.question.sha256}
+    if result.strongest is not None and result.strongest.object.texture is not None:
+        named[result.strongest.object.texture] = result.strongest.object.texture_sha256 or ""
+    for name, sha256 in named.items():
+        file = folder / name
+        there = sha256_of(file) if file.is_file() else "no file"
+        _same(folder, f"SHA-256 of {name}", sha256, there)
+
+
+def _check_searches(folder: Path, result: AuditResult) -> None:
+    """Whether the searches add up, and the judged one is the strongest."""
+    tried = result.tried
+    spent = sum(each.evaluations for each in tried)
+    _same(folder, "budget.evaluations_spent", result.budget.evaluations_spent, spent)
+    ranked = [each for each in tried if each.off_track is not None and each.effect_m is not None]
+    if result.strongest is not None and ranked:
+        best = max(ranked, key=lambda each: (each.off_track, each.effect_m))
+        _same(
+            folder,
+            "tried: the selected one",
+            [each.setting for each in tried if each.selected],
+            [best.setting],
+        )
+
+
+def _check_outcome(folder: Path, result: AuditResult, judged: EffectJudgement) -> None:
+    """Whether the outcome is that of the last judged drives, which is the strongest evidence."""
     outcome = result.verdict.outcome
     possible: tuple[Outcome, ...] = ("found",) if judged.found else ("nothing_found", "cannot_judge")
     if outcome != "worse":
         _same(folder, "verdict", outcome, outcome if outcome in possible else possible[0])
-    if outcome in ("found", "nothing_found"):
-        sentence, numbers = result.verdict.sentence, effect_in_words(judged)
-        _same(folder, "verdict.sentence", numbers if numbers in sentence else sentence, numbers)
 
 
 def _same(folder: Path, what: str, said: Any, computed: Any) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from advnerf_core.data.image_files import write_image
 from advnerf_core.errors import AdvnerfError
@@ -25,8 +26,10 @@ from advnerf_core.report.audit_result import (
     AuditResult,
     AuditStarts,
     AuditVerdict,
+    Evidence,
     JudgedObject,
     NotTried,
+    Outcome,
     PlacedPose,
     PlantedControl,
     StartSet,
@@ -34,15 +37,14 @@ from advnerf_core.report.audit_result import (
     write_audit,
 )
 from nodes.audit.comparing import ATTACK_KEPT
-from nodes.audit.drives import PICTURE
 from nodes.audit.judging import Judged, film, texture_of
 from nodes.audit.kept import RESULT, keep_drives
 from nodes.audit.page import write_page
 from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, SELECTION_STARTS, VICTIM, AuditedQuestion
 from nodes.audit.schedule import NEVER_TRIED
 from nodes.audit.searching import FoundAttack, Searches
+from nodes.audit.sentence import sentence_of
 from nodes.audit.spots import Spot
-from nodes.audit.verdict import effect_in_words
 from nodes.experiment.plan.object_kinds import extent_m, name_of
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import given_victim
@@ -72,6 +74,7 @@ class Known:
     judged: list[Judged] = field(default_factory=list)
     planted: PlantedControl | None = None
     against: AuditComparison | None = None
+    compared: dict[str, Any] = field(default_factory=dict)
     reasons: tuple[str, ...] = ()
     interrupted: bool = False
     seconds: float | None = None
@@ -86,10 +89,37 @@ class Known:
 
 def result_of(known: Known, folder: Path) -> AuditResult:
     """The result of an audit; the pictures that it names are written into its folder."""
+    facts = _facts(known, folder)
+    outcome = _outcome(known)
+    reasons = known.reasons if outcome == "cannot_judge" else ()
+    verdict = AuditVerdict(
+        outcome=outcome,
+        evidence=_evidence(known, outcome),
+        sentence=sentence_of(AuditResult.model_construct(**facts), outcome, reasons),
+        reasons=reasons,
+    )
+    return AuditResult(verdict=verdict, **facts)
+
+
+def _outcome(known: Known) -> Outcome:
+    if known.against is not None and known.against.is_worse:
+        return "worse"
+    if known.reasons:
+        return "cannot_judge"
+    return "found" if known.judged[-1].judgement.found else "nothing_found"
+
+
+def _evidence(known: Known, outcome: Outcome) -> Evidence | None:
+    if outcome == "cannot_judge":
+        return None
+    return known.question.place.evidence if outcome == "worse" else known.judged[-1].evidence
+
+
+def _facts(known: Known, folder: Path) -> dict[str, Any]:
+    """All fields of the result but the verdict."""
     assert known.file is not None, "the experiment file is written first"
     question = known.question
-    return AuditResult(
-        verdict=verdict_of(known),
+    return dict(
         policy=AuditedPolicy(path=question.given, sha256=_sha256_of(known)),
         place=AuditedPlace(
             name=question.place.name,
@@ -125,7 +155,7 @@ def result_of(known: Known, folder: Path) -> AuditResult:
 def write_result(known: Known, result: AuditResult, folder: Path, report: Report) -> str:
     """Write the result and its derived files: the drives, the film, the page; returns failed files, and why."""
     _remove_earlier(known, folder)
-    keep_drives(folder, known.judged)
+    keep_drives(folder, known.judged, known.compared)
     if known.best is not None:
         write_atomically(folder / ATTACK_KEPT, known.best.attack.read_bytes())
     shown = film(known.judged[-1], folder / FILM, report) if known.judged else None
@@ -151,63 +181,6 @@ def _remove_earlier(known: Known, folder: Path) -> None:
     gone += [] if known.judged else [FILM]
     for name in gone:
         (folder / name).unlink(missing_ok=True)
-
-
-def verdict_of(known: Known) -> AuditVerdict:
-    """The conclusion of the audit."""
-    if known.against is not None and known.against.is_worse:
-        evidence = known.question.place.evidence
-        return AuditVerdict(outcome="worse", evidence=evidence, sentence=_worse(known.against))
-    if known.reasons:
-        return AuditVerdict(
-            outcome="cannot_judge",
-            evidence=None,
-            sentence=f"This audit cannot judge the policy here: {known.reasons[0]}.",
-            reasons=known.reasons,
-        )
-    judged = known.judged[-1]
-    found = judged.judgement.found
-    return AuditVerdict(
-        outcome="found" if found else "nothing_found",
-        evidence=judged.evidence,
-        sentence=_sentence(known, judged),
-    )
-
-
-def _sentence(known: Known, judged: Judged) -> str:
-    judgement, place = judged.judgement, known.question.place
-    where = (
-        f"In {place.name}, by its own car" if judged.evidence == "world" else f"In {_copy(known)}, not driven"
-    )
-    moves = effect_in_words(judgement)
-    if judgement.found:
-        others = max(judgement.left["no_object"], judgement.left["plain_object"])
-        plain = "a plain one does not" if others == 0 else f"a plain one, or none, does from {others}"
-        by_picture = int(judged.drives[PICTURE].left(judged.limit_m).sum())
-        picture = f", a photograph in its place does from {by_picture}" if by_picture else ""
-        return f"{where}, {_object(known)} brings the policy {moves}; {plain}{picture}."
-    tried = len(known.searches.found) if known.searches else 0
-    return f"{where}, no object was found within this budget that drives the policy out of its lane: the strongest of {tried} brings it {moves}."
-
-
-def _worse(against: AuditComparison) -> str:
-    effect = against.effect
-    return (
-        f"The policy is worse than in {against.file}: from the same {against.starts} starts it comes {effect.mean_m:.2f} m farther off its path "
-        f"({effect.level:.0%} {effect.low_m:.2f} to {effect.high_m:.2f}), more than the margin of {against.margin_m:.2f} m."
-    )
-
-
-def _copy(known: Known) -> str:
-    quality = f" of {known.fidelity.psnr_db:.1f} dB" if known.fidelity else ""
-    return f"a learned copy{quality} of {known.question.place.name}"
-
-
-def _object(known: Known) -> str:
-    assert known.best is not None
-    placed = known.spots[known.best.spot].placed
-    kind = "panel" if placed.kind == "panel" else name_of(placed.kind)
-    return f"a {placed.side_m:.2g} m {kind} at x {placed.x_m:.2f}, y {placed.y_m:.2f}"
 
 
 def _strongest(known: Known, folder: Path) -> JudgedObject | None:
@@ -248,8 +221,10 @@ def _tried(known: Known) -> Iterator[TriedSearch]:
             space="colours",
             method=each.method,
             seed=each.seed,
+            setting=each.setting,
             evaluations=each.evaluations,
             effect_m=each.effect_m,
+            off_track=each.left,
             selected=each is known.best,
         )
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -27,7 +28,8 @@ from nodes.audit.drives import (
 )
 from nodes.audit.hardening import FOLDER as HARDEN
 from nodes.audit.hardening import export_frames
-from nodes.audit.judging import drive_arms, judge_found, seen_on
+from nodes.audit.judging import COMPARED, drive_arms, judge_found, seen_on
+from nodes.audit.kept import compared_drives
 from nodes.audit.learning import Copies, fidelity_of
 from nodes.audit.outcome import AFTER, BEFORE, Known, result_of, write_result
 from nodes.audit.plan import AuditPlan, as_listed
@@ -142,7 +144,7 @@ class Audit:
         if not fidelity.trusted:
             raise CannotJudgeError(*fidelity.why)
         if self.before is not None:  # first, as a policy that no longer drives is worse, too
-            known.against = self._compare(self.before, copies, plan, known.limit_m)
+            known.against, known.compared = self._compare(self.before, copies, plan, known.limit_m)
         self._require_drives(experiment, known.limit_m)
         spots = self._spots(plan, experiment)
         known.spots = spots
@@ -266,18 +268,18 @@ class Audit:
         if self.harden:
             self.say(f"frames past the object: {export_frames(known.judged[-1], self.folder / HARDEN)}")
 
-    def _compare(self, before: Before, copies: Copies, plan: AuditPlan, limit_m: float) -> AuditComparison:
-        """Drive past the object of an earlier audit, from its starts."""
+    def _compare(
+        self, before: Before, copies: Copies, plan: AuditPlan, limit_m: float
+    ) -> tuple[AuditComparison, dict[str, Any]]:
+        """Drive past the object of an earlier audit, from its starts; the drives are to be kept."""
         plan.add(_BEFORE, [before.listed(self.question.kind)])
         starts, evidence = before.result.starts.judging, self.question.place.evidence
         there = with_starts(copies.ready(_BEFORE, judged=True), starts.count, starts.seed)
-        arms = {
-            name: arm_of(there, name, before.folder / ATTACK_KEPT)
-            for name in (NO_OBJECT, PLAIN_OBJECT, FOUND)
-        }
+        arms = {name: arm_of(there, name, before.folder / ATTACK_KEPT) for name in COMPARED}
         with ProgressDisplay(self.console) as display:
             drives = drive_arms(there, arms, evidence, display.start("driving as then"))
-        return before.compare(drives, evidence, limit_m)
+        found = before.compare(drives, evidence, limit_m)
+        return found, compared_drives(there, drives, limit_m, before.folder, evidence)
 
     def _plant(self, copies: Copies, plan: AuditPlan, spots: list[Spot], limit_m: float) -> PlantedControl:
         """Search a planted weakness with the same schedule, until it is found."""

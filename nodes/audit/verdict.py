@@ -78,15 +78,6 @@ class EffectJudgement:
         return self.p <= 1.0 - LEVEL
 
 
-def effect_in_words(judgement: EffectJudgement) -> str:
-    """The effect with its interval, and how often the car left its lane, as the sentence of a verdict has them."""
-    effect = judgement.effect
-    return (
-        f"{effect.mean_m:.2f} m farther off its path (95 % {effect.low_m:.2f} to {effect.high_m:.2f}) and "
-        f"out of its lane from {judgement.left['object']} of {judgement.starts} starts"
-    )
-
-
 def judge(attacked: ArmDrives, controls: Mapping[Control, ArmDrives], limit_m: float) -> EffectJudgement:
     """Judge an object by its drives and the controls' from the same starts."""
     effects = {name: effect_of(attacked, drives) for name, drives in controls.items()}

@@ -7,18 +7,20 @@ import numpy as np
 import pytest
 
 from advnerf_core.errors import ConfigError
-from advnerf_core.report.audit_result import write_audit
+from advnerf_core.files import sha256_of
+from advnerf_core.report.audit_result import AuditComparison, AuditEffect, read_audit, write_audit
 from nodes.audit.comparing import ATTACK_KEPT, Before
 from nodes.audit.judging import (
     LEARNED_ARMS,
     WORLD_ARMS,
+    comparison_of,
     controls_of,
     disturbed_numbers_of,
-    judgement_of,
     numbers_of,
 )
 from nodes.audit.kept import DRIVES, RESULT, AuditDiffersError, KeptDrivesError, check_audit, read_drives
-from nodes.audit.verdict import effect_in_words
+from nodes.audit.question import FILE as QUESTION
+from nodes.audit.sentence import sentence_of
 from tests.support.audits import audit, audit_result
 from tests.support.commands import advnerf as command
 
@@ -64,17 +66,26 @@ def folder(tmp_path):
     drives = {"surrogate": kept_drives(LEARNED_ARMS), "world": kept_drives(WORLD_ARMS)}
     (tmp_path / DRIVES).write_text(json.dumps(drives))
     found = read_drives(tmp_path)
-    sentence = f"It brings the policy {effect_in_words(judgement_of(found['world'].arms, LIMIT_M))}; a plain one does not."
+    (tmp_path / QUESTION).write_text("name: audit\n")
+    (tmp_path / "panel.png").write_bytes(b"a picture")
+    panel = {**audit()["strongest"]["object"], "texture_sha256": sha256_of(tmp_path / "panel.png")}
+    searches = [
+        {**audit()["tried"][0], "setting": f"1-gradient-{number}", "off_track": left, "effect_m": effect_m}
+        for number, left, effect_m in ((1, 2, 0.5), (2, 4, 0.3), (3, 4, 0.4))
+    ]
     result = audit_result(
-        verdict={"outcome": "found", "evidence": "world", "sentence": sentence, "reasons": []},
+        question={"file": QUESTION, "sha256": sha256_of(tmp_path / QUESTION)},
+        tried=[{**each, "selected": each["setting"] == "1-gradient-3"} for each in searches],
+        budget={**audit()["budget"], "evaluations_spent": 150},
         place={**audit()["place"], "off_track_m": LIMIT_M},
         starts={**audit()["starts"], "judging": {"seed": 2, "count": STARTS}},
-        strongest={**audit()["strongest"], "judgements": [judged(*each) for each in found.items()]},
+        strongest={"object": panel, "judgements": [judged(*each) for each in found.items()]},
         controls=[
             control for name, each in found.items() for control in controls_of(name, each.arms, LIMIT_M)
         ],
     )
-    write_audit(tmp_path / RESULT, result)
+    said = result.verdict.model_copy(update={"sentence": sentence_of(result, "found", ())})
+    write_audit(tmp_path / RESULT, result.model_copy(update={"verdict": said}))
     return tmp_path
 
 
@@ -134,6 +145,23 @@ def shifted(data):
         (lambda data: data["strongest"]["judgements"].pop(0), "judged evidence"),
         (lambda data: data["verdict"].update(outcome="nothing_found"), "verdict: expected found"),
         (lambda data: data["verdict"].update(sentence="It moves by 0.01 m."), r"verdict\.sentence"),
+        (lambda data: data["strongest"]["object"]["pose"].update(x_m=9.0), r"verdict\.sentence"),
+        (lambda data: data["place"].update(name="Elsewhere"), r"verdict\.sentence"),
+        (lambda data: data["question"].update(sha256="0" * 64), r"SHA-256 of audit\.experiment\.yaml"),
+        (
+            lambda data: data["strongest"]["object"].update(texture="a.png"),
+            "SHA-256 of a.png: expected no file",
+        ),
+        (
+            lambda data: data["budget"].update(evaluations_spent=90),
+            r"budget\.evaluations_spent: expected 150",
+        ),
+        (lambda data: data["tried"].pop(), r"evaluations_spent: expected 100"),
+        (
+            lambda data: data["tried"][0].update(off_track=8),
+            r"tried: the selected one\.0: expected 1-gradient-1",
+        ),
+        (lambda data: data["tried"][1].update(effect_m=0.9), r"the selected one\.0: expected 1-gradient-2"),
         (
             lambda data: data["verdict"].update(outcome="cannot_judge", evidence=None, reasons=["no time"]),
             "verdict: expected found",
@@ -176,8 +204,88 @@ def test_drives_that_are_damaged_are_one_error(folder, edit):
         check_audit(folder)
 
 
+def compared(folder, now_m, then_m):
+    """The result of the folder as one that is compared with an earlier one: ends beside the path [m] without any object."""
+    arms = [name for name in WORLD_ARMS if name != "natural_picture"]
+
+    def edit(data, end_m=0.0):
+        data.update(against=kept_drives(arms), against_then=kept_drives(arms))
+        for key, end_m in (("against", now_m), ("against_then", then_m)):
+            for number, states in enumerate(data[key]["states"]["no_object"]):
+                for state in states:
+                    state[1] = end_m * state[0] / 2.0 + 0.001 * number
+
+    change(folder / DRIVES, edit)
+    both = read_drives(folder)
+    numbers = comparison_of(both["against"].arms, both["against_then"].arms, LIMIT_M)
+    result = read_audit(folder / RESULT)
+    fields = {"file": "old/audit.json", "sha256": "0" * 64, "margin_m": 0.04, "starts": STARTS}
+    result = result.model_copy(update={"against": AuditComparison(**fields, **numbers)})
+    outcome = "worse" if result.against.is_worse else "found"
+    said = {"outcome": outcome, "sentence": sentence_of(result, outcome, ())}
+    write_audit(
+        folder / RESULT, result.model_copy(update={"verdict": result.verdict.model_copy(update=said)})
+    )
+
+
+def test_a_policy_that_got_worse_is_held_to_the_drives_that_say_so(folder):
+    compared(folder, 0.6, 0.1)
+    assert check_audit(folder)[-1].endswith(f"against old/audit.json, {STARTS} starts: as the drives say")
+    sentence = read_audit(folder / RESULT).verdict.sentence
+    assert "it comes 0.50 m farther off its path without any object (98% 0.50 to 0.50)" in sentence
+    assert sentence.endswith(f"without any object it leaves its lane from {STARTS}, then from 0.")
+
+
+@pytest.mark.parametrize(
+    ("edit", "says"),
+    [
+        (
+            lambda data: data["against"].update(off_track_alone_then=3),
+            r"against\.off_track_alone_then: expected 0",
+        ),
+        (lambda data: data["against"]["effect"].update(low_m=0.3), r"against\.effect\.low_m"),
+        (lambda data: data["against"].update(past="object"), r"against\.past: expected no_object"),
+        (lambda data: data["against"].update(starts=7), r"against\.starts: expected 8"),
+    ],
+)
+def test_a_comparison_that_was_changed_is_noticed(folder, edit, says):
+    compared(folder, 0.6, 0.1)
+    change(folder / RESULT, edit)
+    with pytest.raises(AuditDiffersError, match=says):
+        check_audit(folder)
+
+
+def test_a_comparison_without_its_drives_is_noticed(folder):
+    compared(folder, 0.12, 0.1)
+    change(folder / DRIVES, lambda data: data.pop("against_then"))
+    with pytest.raises(AuditDiffersError, match="compared drives"):
+        check_audit(folder)
+
+
+def test_what_was_found_or_not_is_said_without_contradiction():
+    found = audit_result()
+    near = found.strongest.judgements[0].model_copy(
+        update={"effect": AuditEffect(mean_m=-0.004, low_m=-0.03, high_m=0.02)}
+    )
+    result = found.model_copy(
+        update={"strongest": found.strongest.model_copy(update={"judgements": (near,)})}
+    )
+    assert sentence_of(result, "nothing_found", ()).endswith(
+        "the strongest of 1 brings it no farther off its path (0.00 m, 95 % -0.03 to 0.02) and out of its lane from 3 of 4 starts; a plain "
+        "one, or none, does from 0, so that this may be chance."
+    )
+
+
 def test_an_audit_in_which_nothing_was_judged_has_no_drives(folder):
-    write_audit(folder / RESULT, audit_result("cannot_judge", strongest=None, controls=[]))
+    result = audit_result("cannot_judge", strongest=None, controls=[])
+    updates = {
+        "question": read_audit(folder / RESULT).question,
+        "budget": result.budget.model_copy(update={"evaluations_spent": 50}),
+        "verdict": result.verdict.model_copy(
+            update={"sentence": sentence_of(result, "cannot_judge", result.verdict.reasons)}
+        ),
+    }
+    write_audit(folder / RESULT, result.model_copy(update=updates))
     for drives in ("{}", None):
         (folder / DRIVES).unlink() if drives is None else (folder / DRIVES).write_text(drives)
         assert check_audit(folder) == [f"{folder}: cannot_judge, nothing was judged"]
