@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from advnerf_core.attack.artifact import load_attack
+from advnerf_core.attack.artifact import AttackFile, load_attack
+from advnerf_core.attack.objectives import CTE
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
@@ -100,8 +101,10 @@ class AttackNode(Node):
         if item.job is not self._job:
             return []
         if item.kind == "progress":
-            best = max(self._progress["best_total_cte_m"], item.data.get("total_cte_m", 0.0))
-            self._progress |= {**item.data, "best_total_cte_m": best}
+            data = {name: value for name, value in item.data.items() if value is not None}
+            best_m = max(self._progress["best_total_cte_m"], data.get("total_cte_m", 0.0))
+            best = float(np.fmax(self._progress["best_value"], data.get("value", math.nan)))
+            self._progress |= {**data, "best_total_cte_m": best_m, "best_value": best}
             self._progress.pop("bytes", None)
         elif item.kind == "image":
             pixels = np.frombuffer(item.pixels, np.uint8).reshape(item.data["height"], item.data["width"], 3)
@@ -136,7 +139,7 @@ class AttackNode(Node):
         text = f"{self._request_id}: {state}"
         if self._job is None:
             return READY, f"{text} {p['text']}".strip()
-        return ACTIVE, f"{text} {p['evaluation']}/{p['evaluations']}, best {p['best_total_cte_m']:.2f} m"
+        return ACTIVE, f"{text} {p['evaluation']}/{p['evaluations']}, best {p['best_value']:.4g} {p['unit']}"
 
     def counters(self) -> dict[str, float]:
         """Evaluations of the present search, and its process id."""
@@ -215,6 +218,7 @@ class AttackNode(Node):
             attack = load_attack(current["file"])
             best = attack.predicted_total_cte_m or 0.0
             self._progress |= {"attack_id": attack.attack_id, "best_total_cte_m": best}
+            self._progress |= _objective_of(attack)
             if attack.clean_drive is not None:
                 clean = attack.clean_drive
                 self._progress |= {"clean_total_cte_m": clean.mean_total_cte_m, "clean_drives": clean.drives}
@@ -236,6 +240,18 @@ class AttackNode(Node):
         )
 
 
+def _objective_of(attack: AttackFile) -> dict[str, Any]:
+    """Objective, unit and values of a finished attack."""
+    clean = math.nan if attack.clean_drive is None else attack.clean_drive.mean_total_cte_m
+    found = attack.extra.get("objective", {"name": CTE, "unit": "m", "clean_value": clean})
+    return {
+        "objective": found["name"],
+        "unit": found["unit"],
+        "best_value": math.nan if attack.value is None else attack.value,
+        "clean_value": found.get("clean_value", math.nan),
+    }
+
+
 def _fresh(state: str, text: str) -> dict[str, Any]:
     return {
         "state": state,
@@ -248,6 +264,11 @@ def _fresh(state: str, text: str) -> dict[str, Any]:
         "best_total_cte_m": 0.0,
         "clean_total_cte_m": math.nan,
         "clean_drives": False,
+        "objective": "",
+        "unit": "",
+        "value": math.nan,
+        "best_value": math.nan,
+        "clean_value": math.nan,
         "seconds": 0.0,
         "attack_id": "",
     }

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from advnerf_core.attack.objectives import CTE
 from nodes.cli.attack import RequestFile
 from nodes.runtime.terminal import Overrides, RunDir, fail_unless
 
@@ -58,21 +59,27 @@ def attack_cancel(
 
 
 def in_words(progress: Any) -> str:
-    """A line about an ``AttackProgress``; its totals stand beside that without an attack."""
+    """A line about an ``AttackProgress``; values of its objective stand beside that without an attack."""
     what = " ".join(filter(None, (progress.state, progress.text)))
+    objective = "total CTE" if progress.objective in ("", CTE) else progress.objective
     if progress.state == "done":
-        return f"done: attack {progress.attack_id}, best total CTE {progress.best_total_cte_m:.2f} m{_beside(progress)} ({progress.text})"
+        return f"done: attack {progress.attack_id}, best {objective} {_value(progress, progress.best_value)}{_beside(progress)} ({progress.text})"
     if progress.evaluation:
         return (
-            f"{what} seed {progress.seed}: {progress.evaluation}/{progress.evaluations}, total CTE "
-            f"{progress.total_cte_m:.2f} m, best {progress.best_total_cte_m:.2f} m{_beside(progress)}"
+            f"{what} seed {progress.seed}: {progress.evaluation}/{progress.evaluations}, {objective} "
+            f"{_value(progress, progress.value)}, best {_value(progress, progress.best_value)}{_beside(progress)}"
         )
     return what
 
 
+def _value(progress: Any, value: float) -> str:
+    digits = f"{value:.2f}" if progress.objective in ("", CTE) else f"{value:.4g}"
+    return f"{digits} {progress.unit}"
+
+
 def _beside(progress: Any) -> str:
     """The drive without an attack; empty before it is known."""
-    if math.isnan(progress.clean_total_cte_m):
+    if math.isnan(progress.clean_value):
         return ""
-    none = "" if progress.clean_drives else ": NO DRIVE, so the total of an attack proves nothing"
-    return f", without attack {progress.clean_total_cte_m:.2f} m{none}"
+    none = "" if progress.clean_drives else ": NO DRIVE, so the value of an attack proves nothing"
+    return f", without attack {_value(progress, progress.clean_value)}{none}"

@@ -149,6 +149,9 @@ def test_a_request_ends_in_the_attack_file_that_the_command_would_have_written(b
     assert last.clean_total_cte_m == pytest.approx(attack.clean_drive.mean_total_cte_m)
     assert last.clean_drives == attack.clean_drive.drives
     assert f", without attack {last.clean_total_cte_m:.2f} m" in in_words(last)
+    assert (last.objective, last.unit) == ("cte", "m")
+    assert last.best_value == pytest.approx(last.best_total_cte_m)
+    assert last.clean_value == pytest.approx(last.clean_total_cte_m)
     assert rgb_image(bench.of("/attack/texture")[-1], "test").shape == (256, 256, 3)
     assert rgb_image(bench.of("/attack/preview")[-1], "test").shape == (132, 400, 3)
     assert bench.node.status()[0] == "ready"
@@ -179,6 +182,22 @@ def test_a_cancel_is_answered_at_once_and_the_same_request_goes_on(bench, tmp_pa
     bench.run_until(lambda: bench.state() == "searching")
     assert bench.progress()[-1].evaluation >= done - 1
     bench.cancel()
+
+
+def test_progress_is_told_in_the_objective_of_the_request(bench, tmp_path):
+    file = tiny_request(tmp_path, evaluations=3)
+    file.write_text(file.read_text().replace("attack: {", "attack: {objective: peak, "))
+    bench.request(request_text(loaded(file)))
+    bench.run_until(lambda: bench.of("/attack/file"))
+    last = bench.progress()[-1]
+    attack = load_attack(last.text)
+    found = attack.extra["objective"]
+    assert (last.objective, last.unit) == ("peak", found["unit"])
+    assert last.best_value == pytest.approx(found["value"])
+    assert last.clean_value == pytest.approx(found["clean_value"])
+    assert f"best peak {found['value']:.4g} {found['unit']}, without attack" in in_words(last)
+    during = [message for message in bench.progress() if message.state == "searching" and message.evaluation]
+    assert max(message.value for message in during) == pytest.approx(found["value"])
 
 
 def test_what_cannot_be_done_is_refused_in_words(bench, tmp_path):

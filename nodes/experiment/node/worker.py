@@ -21,6 +21,7 @@ from advnerf_core.attack.search.record import Evaluation
 from advnerf_core.attack.search.search import evaluation_from_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import read_tensors
+from advnerf_core.plugins import name_in_results
 from advnerf_core.policies.network import tensor_to_images
 from nodes.experiment.node.job import TOGETHER_STATE
 from nodes.experiment.node.search import kept_request, planned_evaluations, run_attack
@@ -66,6 +67,10 @@ class Speaker:
             total_cte_m=0.0 if self._best is None else self._best.predicted_total_cte_m,
             clean_total_cte_m=prepared.clean_drive.mean_total_cte_m,
             clean_drives=prepared.clean_drive.drives,
+            objective=name_in_results(prepared.experiment.config.attack.objective),
+            unit=prepared.problem.objective.unit,
+            clean_value=prepared.clean_value,
+            value=None if self._best is None else self._best.value,
         )
 
     def told(self, evaluation: Evaluation) -> None:
@@ -82,6 +87,7 @@ class Speaker:
             evaluations=self._evaluations,
             loss_m=evaluation.loss_m,
             total_cte_m=evaluation.predicted_total_cte_m,
+            value=evaluation.value,
             seconds=evaluation.seconds,
         )
         if better:
