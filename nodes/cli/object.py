@@ -307,6 +307,6 @@ def _size(model: ObjectModel, digits: int) -> str:
 def _thin(model: ObjectModel) -> list[str]:
     """A warning about a mesh whose shortest side has few voxels."""
     voxels = min(model.about.get("source", {}).get(_SIZE, [math.inf])) / model.grids.voxel
-    if voxels >= _FEW_VOXELS:
+    if voxels >= _FEW_VOXELS or "notes" in model.about:
         return []
     return [f"its shortest side is {voxels:.1f} voxels: it looks wider than it is; raise --resolution"]

@@ -18,7 +18,7 @@ from advnerf_core.objects.voxel.pictures import PosedRgba
 from advnerf_core.objects.voxel.rasterise import draw_mesh
 from advnerf_core.objects.voxel.stages import fit_in_stages
 from advnerf_core.objects.voxel.views import dome, viewing_lens
-from advnerf_core.objects.voxel.voxelise import ObjectGrids, voxelise
+from advnerf_core.objects.voxel.voxelise import MAX_RESOLUTION, ObjectGrids, voxelise
 from advnerf_core.render.cast_object import cast_object
 
 Progress = Callable[[float, str], None]
@@ -53,9 +53,8 @@ def build_from_mesh(
     """
     told = progress or (lambda fraction, text: None)
     told(0.0, "voxelising")
-    start = voxelise(mesh, resolution)
     views = mesh_views(mesh, HELD_OUT_VIEWS, FIT_PIXELS, _HELD_OUT_PHASE)
-    _refuse_lost(Agreement.of(ObjectModel(name, start), views).missing, start, resolution)
+    start, notes = _whole(mesh, views, resolution)
     grids = (
         start
         if steps == 0
@@ -71,18 +70,40 @@ def build_from_mesh(
         "held_out_psnr_db": round(judged.psnr_db, 2),
         "held_out_object_psnr_db": round(judged.object_psnr_db, 2),
         "missing": round(judged.missing, 3),
-        **({"notes": list(mesh.notes)} if mesh.notes else {}),
+        **({"notes": [*mesh.notes, *notes]} if mesh.notes or notes else {}),
         "software_version": version("advnerf"),
     }
     return ObjectModel(name, model.grids, about)
 
 
-def _refuse_lost(missing: float, start: ObjectGrids, resolution: int) -> None:
-    if missing > LOST:
+def _whole(mesh: SurfaceMesh, views: PosedRgba, resolution: int) -> tuple[ObjectGrids, list[str]]:
+    """Voxels that hold a mesh, and what its user should know of them: sheets that no resolution holds are made about a voxel thick.
+
+    Raises:
+        MeshError: They lose most of it, and finer ones would not.
+    """
+    plain = voxelise(mesh, resolution)
+    voxel_mm, missing = 1e3 * plain.voxel, _missing(plain, views)
+    if missing <= LOST:
+        return plain, []
+    if _missing(voxelise(mesh, MAX_RESOLUTION), views) <= LOST:
         raise MeshError(
-            f"expected voxels that hold the object, {resolution} along its longest side lose {missing:.0%} of it: one is "
-            f"{1e3 * start.voxel:.3g} mm, longer than the object's thinnest parts; raise --resolution"
+            f"expected voxels that hold the object, {resolution} along its longest side lose {missing:.0%} of it: one is {voxel_mm:.3g} mm, longer "
+            "than the object's thinnest parts; raise --resolution"
         )
+    thick = voxelise(mesh, resolution, thickened=True)
+    if (missing := _missing(thick, views)) > LOST:
+        raise MeshError(
+            f"expected a mesh that voxels hold, {resolution} along its longest side lose {missing:.0%} of it, as would finer ones: its parts are thinner "
+            "than a voxel; make them thicker, or attack the mesh itself"
+        )
+    return thick, [
+        f"its sheets are thinner than a voxel, and were made about {voxel_mm:.3g} mm thick; raise --resolution for thinner ones"
+    ]
+
+
+def _missing(grids: ObjectGrids, views: PosedRgba) -> float:
+    return Agreement.of(ObjectModel("voxels", grids), views).missing
 
 
 def build_from_images(

@@ -49,12 +49,13 @@ class ObjectGrids:
         return float(self.box_max[0] - self.box_min[0]) / self.density.shape[0]
 
 
-def voxelise(mesh: SurfaceMesh, resolution: int = 64) -> ObjectGrids:
+def voxelise(mesh: SurfaceMesh, resolution: int = 64, thickened: bool = False) -> ObjectGrids:
     """Density and colour grids of a mesh.
 
     Args:
         mesh: The mesh [m]; metres become the object's units.
         resolution: Voxels along the longest side of the box, padding included, 8 to 128.
+        thickened: Whether the body reaches half a voxel farther on each side, so that sheets are not lost between the voxels.
 
     Raises:
         MeshError: A resolution out of range, or a mesh without a surface.
@@ -70,6 +71,8 @@ def voxelise(mesh: SurfaceMesh, resolution: int = 64) -> ObjectGrids:
     surface, sums, hits = _drawn_surface(mesh, box_min, voxel, counts, fine)
     if not surface.any():
         raise MeshError("expected a mesh with a surface, all its triangles are degenerate")
+    if thickened:
+        surface = ndimage.binary_dilation(surface, iterations=fine // 2)
     # The body ends in the middle of its outermost fine cells, the surface at their border, half a fine cell further out.
     ramp = np.clip((0.5 - _coarse(_signed_distance(surface), fine)) / fine, -1.0, 1.0)
     # Cells far from the surface are plainly empty, and rays skip them.

@@ -13,9 +13,10 @@ from PIL import Image
 
 from advnerf_core.objects.mesh.glb import glb_bytes
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
-from advnerf_core.objects.voxel.build import LOST, THIN, advice, build_from_mesh
+from advnerf_core.objects.voxel.build import LOST, THIN, advice, build_from_mesh, draw_object
 from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, part_from_colours, texture_colours
 from advnerf_core.objects.voxel.mesh_files import load_mesh, read_mesh_files
+from advnerf_core.objects.voxel.views import ring, viewing_lens
 
 CASE = Path(__file__).parents[4] / "shared/data/cases/glb_up_and_colour"
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], "<f4")
@@ -359,6 +360,21 @@ def test_voxels_that_lose_the_object_are_refused_or_told():
     fine = build_from_mesh(bottle(), "bottle", 32, 0).about
     assert (fine["missing"] < THIN, advice(fine)) == (True, [])
     assert fine["held_out_object_psnr_db"] < fine["held_out_psnr_db"] - 5.0
+
+
+def test_a_sheet_that_no_voxels_hold_is_made_a_voxel_thick(tmp_path):
+    """A sign of other software is often two triangles."""
+    corners = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 1, 0], [-1, 1, 0]])
+    sheet = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], vertex_colors=[[255, 0, 0]] * 4, process=False)
+    sheet.export(tmp_path / "sign.glb")
+    built = build_from_mesh(load_mesh(tmp_path / "sign.glb"), "sign", 32, 60)
+    assert built.about["missing"] < THIN
+    assert "its sheets are thinner than a voxel, and were made about 71.4 mm thick" in built.about["notes"][0]
+    thick, wide, high = np.subtract(*built.solid_box[::-1])
+    assert 0.5 < thick / built.grids.voxel < 4.0  # of whole voxels, and the sheet lies between two
+    assert (wide, high) == (pytest.approx(2.0, abs=0.25), pytest.approx(1.0, abs=0.25))
+    front = draw_object(built, ring(built.solid_box, 1), viewing_lens(64))[0]
+    np.testing.assert_allclose(front[32, 32], [1.0, 0.0, 0.0, 1.0], atol=0.1)
 
 
 def accessors(**change):
