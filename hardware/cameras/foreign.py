@@ -7,6 +7,7 @@ beside ``kind``; the class is called with it. See docs/cameras.md.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
@@ -89,12 +90,21 @@ def find_camera(name: str, folder: Path | None = None) -> Any:
         PluginError: The camera is unknown, cannot be loaded, or is not a class with a ``Config``.
     """
     found: Any = resolve(name, "camera", {}, GROUP, folder)
-    is_camera = isinstance(found, type) and Camera in found.__mro__
-    if not (is_camera and is_of_settings(getattr(found, "Config", None))):
+    if not (isinstance(found, type) and Camera in found.__mro__):
+        what = f"the class {found.__name__}" if isinstance(found, type) else f"{found!r:.60}"
         raise PluginError(
-            f"camera {name}: expected a class that derives from Camera and has an attribute Config, a pydantic model or a dataclass;"
-            f" got {found!r:.80}; see {_PAGE}"
+            f"camera {name}: expected a class that derives from hardware.cameras.interface.Camera, got {what}; see {_PAGE}"
         )
+    if not is_of_settings(getattr(found, "Config", None)):
+        raise PluginError(
+            f"camera {name}: expected an attribute Config with its keys, a pydantic model or a dataclass (empty if it has none), got none; see {_PAGE}"
+        )
+    try:
+        inspect.signature(found).bind(None)
+    except TypeError as error:
+        raise PluginError(
+            f"camera {name}: expected a class that is called with its Config alone, got another __init__ ({error}); see {_PAGE}"
+        ) from None
     return found
 
 

@@ -73,6 +73,15 @@ class Generator(Camera):
 
     def close(self):
         self.is_open = False
+
+
+class Bare(Camera):
+    pass
+
+
+class Other(Generator):
+    def __init__(self, config, port):
+        pass
 """
 
 
@@ -157,7 +166,15 @@ def test_a_wrong_key_is_one_line(generator: Path, keys: str, message: str) -> No
             r"kind: expected a camera of v4l2, .*folder; got 'webcam'; one of your own is file.py:Name",
         ),
         ("mine.py:Missing", "kind: camera .*: expected a name in mine.py"),
-        ("mine.py:Frame", "expected a class that derives from Camera and has an attribute Config"),
+        (
+            "mine.py:Frame",
+            r"expected a class that derives from hardware\.cameras\.interface\.Camera, got the class Frame",
+        ),
+        ("mine.py:Bare", "expected an attribute Config with its keys, .* got none"),
+        (
+            "mine.py:Other",
+            r"called with its Config alone, got another __init__ \(missing a required argument: 'port'\)",
+        ),
         ("other.py:Generator", "expected a Python file at .*other.py, found none"),
     ],
 )
@@ -199,13 +216,14 @@ def test_the_check_meets_a_good_camera_and_says_what_it_executes(generator: Path
         ("closed", 'raise LinkLost("expected an open camera; call open() first")', "return None", "LinkLost"),
         ("stall", "wait_s > timeout_s", "False", "return None while there is no new frame"),
         ("reopening", "self.is_open, self.next_s = True,", "self.kept = [*getattr(self, 'kept', []), open('/dev/null')]; self.is_open, self.next_s = True,", "left open"),
-        ("timeout", "min(wait_s, timeout_s)", "0.5", "within its timeout"),
+        ("timeout", "min(wait_s, timeout_s)", "0.5", r"read\(0.03\) to return within its timeout, got 0\.5"),
+        ("newest", "time.monotonic() + 1.0 /", "self.next_s + 1.0 /", r"the newest frame after a pause, got \d+ frames at once: read\(\) hands out a queue"),
+        ("frames", "return Frame(", "return rgb, (", r"expected read\(\) to return a hardware\.cameras\.interface\.Frame or None, got "),
     ],
 )  # fmt: skip
 def test_the_check_finds_what_is_wrong(
-    generator: Path, monkeypatch: pytest.MonkeyPatch, part: str, before: str, after: str, message: str
+    generator: Path, part: str, before: str, after: str, message: str
 ) -> None:
-    monkeypatch.setattr(camera_check, "_LATE_S", 0.3)
     assert before in GENERATOR
     generator.write_text(GENERATOR.replace(before, after))
     camera = parse_source(f"{{kind: {generator}:Generator, width: 6}}").camera()
