@@ -12,7 +12,7 @@ from typing import Any
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import MessageDefinitionFormat
 
-from nodes.bags.formats import BagFormat, no_checksums
+from nodes.bags.formats import BagFormat, mend_advice, no_checksums
 from nodes.bags.info import BagMessage, FileInfo, TopicInfo
 from nodes.bags.message_definitions import IDL, MSG, full_type_name
 from nodes.bags.stored_types import CDR, ROS1, RecordedTopic
@@ -114,7 +114,7 @@ def _opened(path: Path, form: BagFormat) -> Iterator[Any]:
     except _NONSENSE as error:
         said = " ".join(str(error).split())
         raise BagError(
-            f"{path} is {form.value}, and cannot be read: {type(error).__name__} {said:.160}"
+            f"{path} is {form.value}, and cannot be read: {type(error).__name__} {said:.160}; {mend_advice(path, form)}"
         ) from error
 
 

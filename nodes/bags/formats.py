@@ -60,6 +60,13 @@ def no_checksums(form: BagFormat) -> str:
     return f"{form.value} has no checksums"
 
 
+def mend_advice(path: Path, form: BagFormat) -> str:
+    """Say what rebuilds a damaged bag of another format: the tools of its own software."""
+    if form is BagFormat.ROS1:
+        return f"if its recording was cut short, rebuild its index: rosbag reindex {path}"
+    return f"save what is left: sqlite3 {path} .recover | sqlite3 {path.with_suffix('.saved.db3')}, then: ros2 bag reindex {path.parent}"
+
+
 def require_mcap(path: Path, verb: str) -> None:
     """Refuse a bag of another format, for operations that only work with MCAP.
 

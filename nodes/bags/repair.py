@@ -22,7 +22,8 @@ from mcap.records import Channel, ChunkIndex, Message, Schema
 
 from advnerf_core.files import write_atomically
 from nodes.bags.assemble import FileLayout, assemble, contents_of
-from nodes.bags.formats import require_mcap
+from nodes.bags.foreign import read_stored
+from nodes.bags.formats import BagFormat, recognise, require_mcap
 from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME, journal_of, read_journal
 from nodes.bags.metadata import rosbag2_metadata
 from nodes.bags.parts import METADATA_FILE
@@ -85,6 +86,10 @@ def repair(file: Path, force: bool = False, keep_original: bool = True, in_place
         BagError: The file is not MCAP, is being written, or would lose too much. The file is then unchanged.
     """
     path = file.resolve()
+    if (form := recognise(path)) is not BagFormat.MCAP:
+        read_stored(
+            path, form, path.stat().st_size
+        )  # a damaged one says what rebuilds it, as it cannot be converted
     require_mcap(path, "repaired")
     try:
         before = path.stat()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from nodes.bags.info import BagMessage
 from nodes.bags.message_definitions import Definition, parse_definition
 from nodes.bags.reader import has_publish_times, read_messages, recorded_topics
 from nodes.bags.stored_types import ROS1, RecordedTopic
@@ -45,16 +47,26 @@ class Delays:
 
 def read_delays(bag: Path) -> dict[str, Delays]:
     """Read the delays of every topic with messages, by name. The whole bag is read."""
-    stored = {name: topic for name, topic in recorded_topics(bag).items() if _begins_with_stamp(topic)}
+    stamp_of = read_stamps(bag)
     rows: dict[str, list[_Times]] = {}
     for message in read_messages(bag, as_recorded=True):
-        recorded = stored.get(message.topic)
-        stamp_ns = 0 if recorded is None else _stamp_ns(message.cdr, recorded.serialization)
+        stamp_ns = stamp_of(message)
         rows.setdefault(message.topic, []).append(
             (stamp_ns, message.publish_ns, message.log_ns, message.sequence)
         )
     published = has_publish_times(bag)
     return {topic: _delays(found, published) for topic, found in rows.items()}
+
+
+def read_stamps(bag: Path) -> Callable[[BagMessage], int]:
+    """A function that reads the stamp of a message as recorded [ns], without decoding it; 0 if it has none."""
+    stored = {name: topic for name, topic in recorded_topics(bag).items() if _begins_with_stamp(topic)}
+
+    def stamp_ns(message: BagMessage) -> int:
+        recorded = stored.get(message.topic)
+        return 0 if recorded is None else _stamp_ns(message.cdr, recorded.serialization)
+
+    return stamp_ns
 
 
 def _delays(times_ns: list[_Times], published: bool) -> Delays:

@@ -9,7 +9,7 @@ from functools import lru_cache
 from itertools import accumulate, pairwise
 from pathlib import Path
 
-from nodes.bags.reader import message_spans, read_messages, read_times_as_written
+from nodes.bags.reader import has_publish_times, message_spans, read_messages, read_times_as_written
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
 
@@ -17,6 +17,7 @@ from nodes.runtime.errors import BagError
 LONGEST_SILENCE_S = 3600.0
 # A recorder writes the messages of a topic as it receives them, a second or so in a chunk: such chunks need not be read.
 _MOST_BACK_S = 2.0
+_OVERTAKEN_S = 0.1  # a message may be written after a later one
 SET_BACK = "the recorder's clock was set back, and messages are read in the order of log time, not of the drive; record the drive again"
 _UNITS = (("year", 365.25 * 86400.0), ("day", 86400.0), ("hour", 3600.0))
 
@@ -85,18 +86,29 @@ def read_steps_back(bag: Path) -> tuple[str, ...]:
 def require_order(bag: Path, topic: str, numbers: Sequence[int]) -> None:
     """Refuse a topic whose messages lie in another order than they were published in: the recorder's clock was set back while it ran.
 
-    Numbers also go back where the publisher was restarted, which is only said: its messages are in order.
+    Numbers also go back where the publisher was restarted, which is only said: its messages are in order. Bags of other recorders have no
+    numbers, or zeros: their log times alone tell it.
 
     Args:
         numbers: The messages' numbers from their publisher, in the order of the bag.
 
     Raises:
-        BagError: Their numbers go back more than once, and log times go back as they were written.
+        BagError: Their numbers go back more than once, and log times go back as they were written; or these go back, and there are no numbers.
     """
-    if (back := sum(after < before for before, after in pairwise(numbers))) < 2:
+    numbered = has_publish_times(bag) and any(numbers)
+    back = sum(after < before for before, after in pairwise(numbers))
+    if numbered and back < 2:
         return
-    written_ns = (log_ns for name, log_ns in read_times_as_written(bag) if name == topic)
-    if any(after < before for before, after in pairwise(written_ns)):
+    written_ns = [log_ns for name, log_ns in read_times_as_written(bag) if name == topic]
+    steps_ns = [before - after for before, after in pairwise(written_ns)]
+    if not numbered:
+        if (step_s := max(steps_ns, default=0) / NS_PER_S) > _OVERTAKEN_S:
+            raise BagError(
+                f"expected the messages of {topic} in {bag} in the order of the drive, got log times that go back by {step_s:.2g} s as they were "
+                f"written; {SET_BACK}"
+            )
+        return
+    if any(step > 0 for step in steps_ns):
         raise BagError(
             f"expected the messages of {topic} in {bag} in the order of their publication, got {back} that go back: the recorder's clock was set back "
             "while it ran, so that two stretches of time are mixed; record the drive again"

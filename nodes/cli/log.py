@@ -47,6 +47,7 @@ def log_export(
     from nodes.runtime.progress import ProgressDisplay
 
     found = open_log(log.path, log.choice(log_options.choice()))
+    print("".join(f"note: {note}\n" for note in found.notes), end="")
     with ProgressDisplay() as display:
         report = display.start("export")
         done = write_lerobot(

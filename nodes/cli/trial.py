@@ -94,7 +94,9 @@ def evaluate(
     ] = False,
 ) -> None:
     """Compute how far the car left its path in a bag, with the metrics of a trial."""
+    from advnerf_core.errors import AdvnerfError
     from nodes.lab.trials.bags import evaluate_bag
+    from nodes.runtime.errors import BagError
 
     rows = table(
         "bag",
@@ -108,8 +110,16 @@ def evaluate(
         "stopped early",
         "checksums",
     )
+    refused = list[Exception]()
     for bag in bags:
-        for found in evaluate_bag(bag, room, ticks):
+        try:
+            drives = evaluate_bag(bag, room, ticks)
+        except (AdvnerfError, OSError) as error:
+            if len(bags) == 1:
+                raise
+            refused.append(error)
+            continue
+        for found in drives:
             if as_json:
                 print(json.dumps(found))
                 continue
@@ -121,8 +131,12 @@ def evaluate(
                 _stopped(found),
                 "unchecked" if found["unchecked"] else "agree",
             )
-    if not as_json:
+    if not as_json and len(refused) < len(bags):
         print_table(rows)
+    if refused:
+        raise BagError(
+            f"{len(refused)} of {len(bags)} bags were not evaluated: {'; '.join(map(str, refused))}"
+        )
 
 
 def _totals(found: dict[str, Any]) -> tuple[str, ...]:

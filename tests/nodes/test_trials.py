@@ -1,4 +1,5 @@
 import json
+import re
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -290,6 +291,20 @@ def test_a_drive_that_a_fault_of_the_stack_ended_is_no_result_of_a_bag_either(tm
     assert whole["counts"]
     shown = CliRunner().invoke(app, ["bag", "evaluate", str(bag), "--ticks", "20"], env={"COLUMNS": "240"})
     assert f"{said}, after 9 ticks" in shown.stdout
+
+
+def test_a_bag_that_cannot_be_evaluated_leaves_the_others_their_rows(tmp_path):
+    good = write_bag(tmp_path, [(1.0, 2.2, "disarmed by trial: trial is over")])
+    bad = copied(good, tmp_path / "bad", lambda each: each.topic != "/safety/state")
+    arguments = ["bag", "evaluate", str(bad), str(good), "--ticks", "20"]
+    shown = CliRunner().invoke(app, arguments, env={"COLUMNS": "240"})
+    assert str(good) in shown.stdout
+    assert "agree" in shown.stdout
+    assert re.fullmatch(
+        r"1 of 2 bags were not evaluated: expected /safety/state, .*", str(shown.exception), re.DOTALL
+    )
+    rows = CliRunner().invoke(app, [*arguments, "--json"]).stdout.splitlines()
+    assert [json.loads(row)["bag"] for row in rows if row.startswith("{")] == [str(good)]
 
 
 def test_a_drive_whose_end_is_not_in_the_bag_is_no_result(tmp_path):

@@ -19,9 +19,8 @@ ROS1_STORE, HUMBLE = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS
 def rgb_at(index, height=188, width=336):
     """A picture without symmetry in its colours."""
     rows, columns = np.mgrid[0:height, 0:width]
-    return np.stack([(rows + 7 * index) % 256, columns * 255 // width, 200 - rows // 2], axis=2).astype(
-        np.uint8
-    )
+    red, green = (rows + 7 * index) % 256, (columns * 255 // width + index) % 256
+    return np.stack([red, green, 200 - rows // 2], axis=2).astype(np.uint8)
 
 
 def state_at(index):

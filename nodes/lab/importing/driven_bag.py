@@ -15,6 +15,7 @@ from advnerf_core.geometry import Array
 from calibration.schema import CameraCalibration, load_calibration, parse_calibration
 from nodes.bags.decoded import read_poses
 from nodes.bags.images import image_messages, image_topic
+from nodes.bags.one_clock import require_one_clock
 from nodes.bags.reader import read_attachment, read_info
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.lab.importing.errors import ImportRecordingError
@@ -79,6 +80,7 @@ def take_frames(
     camera = _camera(bag, calibration)
     poses = PoseBuffer.of_recording(read_poses(bag, CAR_TOPIC))
     topic = image_topic(bag)
+    require_one_clock(bag, (topic, CAR_TOPIC))
     stamps = [stamp_ns(message) for message in image_messages(bag, topic)]
     placed = [
         (index, stamp, pose.T @ camera.mount)

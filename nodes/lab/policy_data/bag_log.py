@@ -33,8 +33,10 @@ from advnerf_core.data.logs.drive_log import (
 from advnerf_core.geometry import yaw_of
 from nodes.bags.images import CAMERA_TOPICS
 from nodes.bags.info import BagInfo, BagMessage
+from nodes.bags.one_clock import OneClockError, require_one_clock
 from nodes.bags.parts import unread_files
 from nodes.bags.reader import read_attachments, read_info, read_messages
+from nodes.bags.stamps import read_stamps
 from nodes.bags.time_gaps import LONGEST_SILENCE_S, find_gaps
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
@@ -46,12 +48,11 @@ from nodes.runtime.topics import topic as topic_row
 
 CAR_TOPIC = "/vicon/car"
 _SAFETY, _SENT, _EXPERT = "/safety/state", "/motor/sent", "/expert/state"
-_IMAGES = ("/compositor/image", *CAMERA_TOPICS)
+OWN_IMAGES = ("/compositor/image", *CAMERA_TOPICS)
 _ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 _LIKE_STEERING = re.compile("ackermann|twist|float|steer|drive|control|cmd", re.IGNORECASE)
 _JOIN_S = 0.12
 _MOST_BACK_S = 1.0  # messages of one topic may overtake each other, but no clock of a drive goes back
-_MOST_APART_S = 0.5  # delays until the recording differ by less
 _TIMED = 200  # images from which the rate is determined
 _STAMPS = 8  # messages that show whether a topic is stamped
 _Time = Callable[[BagMessage, Any], int]
@@ -103,7 +104,9 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
     typed = {topic.name: topic.type for topic in info.topics if topic.count}
     found = [name for name, kind in typed.items() if kind in (IMAGE_TYPE, COMPRESSED_TYPE)]
     cameras = tuple(
-        sorted(found, key=lambda name: (_IMAGES.index(name) if name in _IMAGES else len(_IMAGES), name))
+        sorted(
+            found, key=lambda name: (OWN_IMAGES.index(name) if name in OWN_IMAGES else len(OWN_IMAGES), name)
+        )
     )
     images = chosen_name(choice.images, cameras, "images", bag)
     controls = tuple(name for name, kind in typed.items() if name == _SENT or kind == _ACKERMANN)
@@ -119,13 +122,12 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
     others = [name for name in cameras if name != images]
     with _naming(others):
         first_ns = _first_times(bag, kinds)
-    unstamped = [
-        topic
-        for topic, times in first_ns.items()
-        if len(times) > 1 and len({stamp for _, stamp in times}) == 1
-    ]
+    unstamped = [topic for topic, times in first_ns.items() if len(times) > 1 and len(set(times)) == 1]
     if not unstamped:
-        _require_one_clock(bag, first_ns)
+        try:
+            require_one_clock(bag, [*kinds, *joined])
+        except OneClockError as error:
+            raise LogError(str(error)) from error
     time_ns = _recorded_ns if unstamped else _stamped_ns
     spans = cache(partial(_spans, info, [*joined, *([steering] if steering else [])] or [images]))
     track = cache(lambda: _read_track(bag, steering, joined, time_ns, spans()))
@@ -138,7 +140,7 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
         controls,
         SteeringUnit(steering, 1.0, "left").chosen(choice) if steering else None,
         counts[images],
-        _rate_hz(bag, images),
+        _rate_hz(bag, images, images in unstamped),
         counts.get(CAR_TOPIC, 0),
         lambda: np.array([each[1] for each in track().sent], np.float64),
         lambda: _frames(bag, images, others, track(), time_ns, spans()),
@@ -161,9 +163,10 @@ def _naming(others: Sequence[str]) -> Iterator[None]:
         raise LogError(f"{error}; or choose other images with --images: {', '.join(others)}") from error
 
 
-def _rate_hz(bag: Path, images: str) -> float:
-    messages = islice(read_messages(bag, [images], as_recorded=True), _TIMED)
-    return median_rate_hz([message.log_ns / NS_PER_S for message in messages])
+def _rate_hz(bag: Path, images: str, unstamped: bool) -> float:
+    """Images per second, by their stamps: a link may deliver them in bursts."""
+    messages, stamp_of = islice(read_messages(bag, [images], as_recorded=True), _TIMED), read_stamps(bag)
+    return median_rate_hz([(each.log_ns if unstamped else stamp_of(each)) / NS_PER_S for each in messages])
 
 
 def _format(info: BagInfo) -> str:
@@ -204,8 +207,8 @@ def _steering_type(topic: str) -> str:
     return topic_row(topic).type if topic == _SENT else _ACKERMANN
 
 
-def _first_times(bag: Path, kinds: Mapping[str, str]) -> dict[str, list[tuple[int, int]]]:
-    """Times of recording and stamps [ns] of the first messages of topics. If all stamps are equal, as of a node that leaves them at zero, they join nothing.
+def _first_times(bag: Path, kinds: Mapping[str, str]) -> dict[str, list[int]]:
+    """Stamps [ns] of the first messages of topics. If all are equal, as of a node that leaves them at zero, they join nothing.
 
     Args:
         kinds: Types by topic.
@@ -213,27 +216,8 @@ def _first_times(bag: Path, kinds: Mapping[str, str]) -> dict[str, list[tuple[in
     found = {}
     for topic, kind in kinds.items():
         messages = islice(read_messages(bag, [topic], types={topic: kind}), _STAMPS)
-        found[topic] = [(each.log_ns, _stamped_ns(each, decode(kind, each.cdr))) for each in messages]
+        found[topic] = [_stamped_ns(each, decode(kind, each.cdr)) for each in messages]
     return found
-
-
-def _require_one_clock(bag: Path, first_ns: Mapping[str, Sequence[tuple[int, int]]]) -> None:
-    """Refuse stamps that no message can have when it is recorded, unless all have them: images would get the steering of other times.
-
-    Args:
-        first_ns: Times of recording and stamps by topic.
-    """
-    ahead_s = {
-        topic: min(stamp - log for log, stamp in times) / NS_PER_S
-        for topic, times in first_ns.items()
-        if times
-    }
-    first, last = min(ahead_s, key=ahead_s.__getitem__), max(ahead_s, key=ahead_s.__getitem__)
-    if ahead_s[last] > _JOIN_S and ahead_s[last] - ahead_s[first] > _MOST_APART_S:
-        raise LogError(
-            f"{bag}: expected stamps of one clock, got those of {last} {ahead_s[last]:.3g} s after their recording, and those of {first} "
-            f"{-ahead_s[first]:.3g} s before it; set the clocks of all computers (chrony) and record again"
-        )
 
 
 def _stamped_ns(message: BagMessage, decoded: Any) -> int:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.data.image_files import Rgb
 from advnerf_core.data.logs.choice import LogError
 from advnerf_core.data.logs.drive_log import (
     FASTEST_HZ,
@@ -81,12 +82,16 @@ def frames_of(log: DriveLog, view: PolicyView, expert: Expert | None, labels: La
     counts = dict.fromkeys(("not armed", "no pose", NO_COMMAND, "disturbed", "too far from the path"), 0)
     counts |= {reason: int(count) for reason, count in log.left_out.items()}
     images, states, steering, recorded, stamps = [], [], [], [], []
+    first: Rgb | None = None
+    differ = False
     for frame in log.frames():
         if why := _unusable(frame, expert, labels):
             counts[why] = counts.get(why, 0) + 1
             continue
         _require_size(frame.image, view, frame.place)
         sent_rad = math.nan if log.unit is None else log.unit.wheel_rad(frame.steering, frame.place)
+        first = frame.image if first is None else first
+        differ = differ or not np.array_equal(frame.image, first)
         images.append(view.image(frame.image))
         states.append(frame.state)
         recorded.append(sent_rad)
@@ -96,6 +101,10 @@ def frames_of(log: DriveLog, view: PolicyView, expert: Expert | None, labels: La
         )
     if len(images) < LEAST_FRAMES:
         raise too_few_frames(log, LEAST_FRAMES, len(images), counts)
+    if not differ:
+        raise LogError(
+            f"expected images that differ in {log.path}, got {len(images)} equal ones of {log.images}; choose others with --images, or record again"
+        )
     count = len(images)
     frames = Frames(
         np.stack(images),

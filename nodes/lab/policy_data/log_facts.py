@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from advnerf_core.data.image_files import Rgb
 from advnerf_core.data.logs.choice import LogError
 from advnerf_core.data.logs.drive_log import DriveLog
+from nodes.bags.images import CAMERA_TOPICS
 from nodes.lab.policy_data.frames import HOLDOUT_EVERY, LEAST_FRAMES
 
 _LOOKED_AT, _LOOKING_S = 32, 3.0
@@ -40,6 +41,7 @@ class LogFacts:
         looked_at: Images that were looked at.
         joined: Whether a steering value belongs to one of them.
         has_camera: Whether the calibration of the camera is attached.
+        has_room: Whether the room file is attached.
         other_size: Where an image has another size than the first; empty if none has.
     """
 
@@ -51,6 +53,7 @@ class LogFacts:
     looked_at: int
     joined: bool
     has_camera: bool
+    has_room: bool
     other_size: str
 
     def verdicts(self) -> list[Verdict]:
@@ -86,7 +89,8 @@ class LogFacts:
 
     def _policy(self) -> Verdict:
         log = self.log
-        by_expert = "labels by the expert at the poses" if log.poses and log.labels == "expert" else ""
+        room = "" if self.has_room else ", with --room, as no room.yaml is attached"
+        by_expert = f"labels by the expert at the poses{room}" if log.poses and log.labels == "expert" else ""
         why = self._unusable_images() or self.other_size or ("" if by_expert else self._unusable_steering())
         if why:
             return Verdict("learn a policy", False, why)
@@ -102,6 +106,11 @@ class LogFacts:
         is_bag = log.format.startswith("bag")
         if is_bag and not log.poses:
             return Verdict("learn a scene", False, "no poses on /vicon/car")
+        if is_bag and log.images not in CAMERA_TOPICS:
+            topics = " or ".join(CAMERA_TOPICS)
+            return Verdict(
+                "learn a scene", False, f"scene from-bag reads images on {topics}, these are on {log.images}"
+            )
         if is_bag:
             missing = "" if self.has_camera else ", with --calibration, as no camera.yaml is attached"
             return Verdict("learn a scene", True, f"advnerf scene from-bag{missing}")
@@ -152,5 +161,6 @@ def read_facts(log: DriveLog) -> LogFacts:
         looked_at,
         joined,
         "camera.yaml" in log.attached(),
+        "room.yaml" in log.attached(),
         other_size,
     )

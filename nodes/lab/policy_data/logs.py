@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from advnerf_core.data.logs.choice import LogChoice, LogError, LogRequest
@@ -12,7 +12,7 @@ from advnerf_core.data.logs.donkey import MANIFEST, META, read_tub
 from advnerf_core.data.logs.drive_log import DriveLog, Labels
 from advnerf_core.data.logs.lerobot import INFO, read_lerobot
 from nodes.bags.parts import holds_bag, is_bag_file
-from nodes.lab.policy_data.bag_log import read_bag_log
+from nodes.lab.policy_data.bag_log import OWN_IMAGES, read_bag_log
 
 _FORMATS = (
     "a bag (.mcap, .db3, .bag, or its folder), a Donkeycar tub, a CSV file, a folder with Udacity's driving_log.csv, "
@@ -80,6 +80,14 @@ def open_log(path: Path, choice: LogChoice | None = None) -> DriveLog:
         AdvnerfError: The format is unknown, or the log is damaged.
     """
     choice = choice or LogChoice()
+    log = _read(path, choice)
+    if choice.images is None and len(log.cameras) > 1 and log.images not in OWN_IMAGES:
+        note = f"images of {log.images}, the first of {', '.join(log.cameras)}; --images chooses others"
+        return replace(log, notes=(*log.notes, note))
+    return log
+
+
+def _read(path: Path, choice: LogChoice) -> DriveLog:
     if path.suffix.lower() == ".csv":
         return read_csv_log(path, choice)
     if is_bag_file(path):

@@ -16,6 +16,7 @@ from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Array
 from calibration.schema import RoomCalibration, load_calibration, parse_calibration
 from nodes.bags.decoded import read_decoded
+from nodes.bags.one_clock import require_one_clock
 from nodes.bags.reader import read_attachment, read_attachments, read_info, read_messages
 from nodes.bags.time_gaps import skipped_gaps
 from nodes.control.arming_gates import NOT_HELD
@@ -27,7 +28,7 @@ from nodes.runtime.errors import BagError
 from nodes.runtime.messages import pose_matrix, stamp_ns
 from nodes.runtime.paths import RESOLVED_NAME
 
-_ROOM, _CAR = "room.yaml", "/vicon/car"
+_ROOM, _CAR, _SAFETY = "room.yaml", "/vicon/car", "/safety/state"
 _ACTS, _LET_GO = "/operator/act", "let_go"
 # A drive begins with a car that stands: without an arming before it, this long [s].
 _STOOD_S = 1.0
@@ -61,7 +62,8 @@ def find_drives(bag: Path) -> list[DriveSpan]:
     Raises:
         BagError: The car was never armed, never moved while armed, or was driving when the recording began.
     """
-    _require(bag, ("/safety/state", _CAR))
+    _require(bag, (_SAFETY, _CAR))
+    require_one_clock(bag, (_SAFETY, _CAR))
     armings = _armings(bag)
     if not armings:
         raise BagError(
@@ -238,7 +240,7 @@ def _armings(bag: Path) -> list[_Arming]:
     found: list[_Arming] = []
     since_ns: int | None = None
     disarmed = False
-    for state in read_decoded(bag, "/safety/state"):
+    for state in read_decoded(bag, _SAFETY):
         at_ns = stamp_ns(state)
         if state.armed and since_ns is None:
             since_ns = at_ns

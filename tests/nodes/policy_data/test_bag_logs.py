@@ -2,6 +2,8 @@
 
 import re
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,14 +17,27 @@ from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.view import PolicyView
+from nodes.bags.one_clock import OneClockError
+from nodes.bags.reader import read_attachments, read_messages
 from nodes.bags.writer import BagWriter
+from nodes.lab.importing.driven_bag import BagConfig, take_frames
 from nodes.lab.policy_data.frames import frames_of, view_for_size
 from nodes.lab.policy_data.log_facts import read_facts
 from nodes.lab.policy_data.logs import open_log
-from nodes.runtime.messages import encode, header, image_message, pose_message, types
+from nodes.runtime.messages import (
+    decode,
+    encode,
+    header,
+    image_message,
+    ns_from_stamp,
+    pose_message,
+    stamp_from_ns,
+    types,
+)
 from tests.support.commands import advnerf
 from tests.support.foreign_samples import IMAGE, Make
 
+TWIN_CAMERA = Path(__file__).parents[3] / "calibration" / "twin" / "camera.yaml"
 START_NS, STEP_NS, COUNT = 1_800_000_000_000_000_000, 100_000_000, 24
 ACKERMANN, DRIVE = "ackermann_msgs/msg/AckermannDriveStamped", "ackermann_msgs/msg/AckermannDrive"
 DEFINITIONS = {
@@ -124,6 +139,7 @@ def write_ackermann(
     count=6,
     going_back=(),
     depths=(),
+    more_images=(),
     log_back_ns=0,
     repeated=(),
     kind=ACKERMANN,
@@ -137,6 +153,7 @@ def write_ackermann(
         step: Steering of an image above that of the one before.
         going_back: Topics whose clock jumps 2 s back before the fourth image.
         depths: Topics with images of depths.
+        more_images: Topics with one picture that never changes.
         log_back_ns: By how much the recorder's clock is set back before the fourth image [ns].
         kind: Type of the commands.
         ahead_s: By how much the clock of the commands is ahead [s].
@@ -157,6 +174,8 @@ def write_ackermann(
         )
     with writer:
         images = writer.add_connection("/front/image", IMAGE, typestore=store)
+        still = make.image(0)
+        still_images = [writer.add_connection(topic, IMAGE, typestore=store) for topic in more_images]
         depth_images = [writer.add_connection(topic, IMAGE, typestore=store) for topic in depths]
         drives = [writer.add_connection(topic, kind, typestore=store) for topic in topics]
         for k in range(count):
@@ -168,6 +187,9 @@ def write_ackermann(
             if k in repeated:
                 image.header.stamp = make.header(k - 1, "camera").stamp
             writer.write(images, t, pack(image, IMAGE))
+            for each in still_images:
+                still.header.stamp = image.header.stamp
+                writer.write(each, t, pack(still, IMAGE))
             image.encoding = "32FC1"
             for depth in depth_images:
                 writer.write(depth, t, pack(image, IMAGE))
@@ -221,16 +243,22 @@ def test_another_recording_in_the_folder_of_a_bag_is_named(tmp_path):
     assert open_log(bag).count == open_log(other).count
 
 
-@pytest.mark.parametrize(
-    ("going_back", "place"),
-    [(("/front/image", "/drive"), "/drive"), (("/front/image",), "image 3"), (("/drive",), "/drive")],
-)
-def test_two_drives_whose_stamps_overlap_are_not_joined_with_each_other(tmp_path, going_back, place):
-    log = open_log(write_ackermann(tmp_path / "drive", "ros2", going_back=going_back))
+def test_two_drives_whose_stamps_overlap_are_not_joined_with_each_other(tmp_path):
+    log = open_log(write_ackermann(tmp_path / "drive", "ros2", going_back=("/front/image", "/drive")))
     with pytest.raises(
-        LogError, match=rf"drive, {place}: expected stamps that go forward, got one 1\.9 s before"
+        LogError, match=r"drive, /drive: expected stamps that go forward, got one 1\.9 s before"
     ):
         list(log.frames())
+
+
+@pytest.mark.parametrize("topic", ["/front/image", "/drive"])
+def test_a_clock_of_one_topic_that_is_set_back_in_the_drive_is_refused(tmp_path, topic):
+    other = {"/front/image": "/drive", "/drive": "/front/image"}[topic]
+    said = rf"expected stamps of one clock, got those of {other} (0|1e-06) s before their recording, and those of {topic} 2 s before it"
+    for count in (8, 300):
+        bag = write_ackermann(tmp_path / f"drive{count}", "ros2", count=count, going_back=(topic,))
+        with pytest.raises(LogError, match=said):
+            open_log(bag)
 
 
 @pytest.mark.parametrize("form", ["ros1", "ros2"])
@@ -285,11 +313,80 @@ def test_a_log_that_training_refuses_is_not_promised(tmp_path, change, told):
     assert [each.possible for each in facts.verdicts()][::2] == [True, True]
 
 
+def poses_of_another_clock(folder, log_path, shift_ns):
+    """A copy of a bag of ours whose poses alone are stamped by another clock."""
+    with BagWriter(folder, read_attachments(log_path)) as copy:
+        for message in read_messages(log_path):
+            cdr = message.cdr
+            if message.topic == "/vicon/car":
+                found = decode("geometry_msgs/msg/PoseStamped", cdr)
+                found.header.stamp = stamp_from_ns(ns_from_stamp(found.header.stamp) + shift_ns)
+                cdr = encode(found)
+            copy.write(message.topic, cdr, message.log_ns, message.publish_ns, message.sequence)
+    return folder
+
+
+@pytest.mark.parametrize(("shift_s", "said"), [(2, "2 s after"), (-2, "2 s before")])
+def test_poses_of_another_clock_are_refused(tmp_path, shift_s, said):
+    """The expert's labels were those of places where the car was not."""
+    bag = poses_of_another_clock(tmp_path / "other", write_bag(tmp_path / "bag"), shift_s * 10**9)
+    with pytest.raises(LogError, match=f"expected stamps of one clock, got .*those of /vicon/car {said}"):
+        open_log(bag)
+    with pytest.raises(OneClockError, match="expected stamps of one clock"):
+        take_frames(bag, tmp_path / "images", BagConfig(), lambda *_: None, TWIN_CAMERA)
+
+
+def test_the_rate_is_that_of_the_stamps(tmp_path):
+    """A link delivers pictures in bursts."""
+    bag = write_bag(tmp_path / "bag")
+    with BagWriter(tmp_path / "bursts", {}) as copy:
+        for number, message in enumerate(read_messages(bag)):
+            late_ns = message.log_ns + 1000 * number if number % 16 else message.log_ns
+            in_burst = late_ns // (4 * STEP_NS) * 4 * STEP_NS + 4 * STEP_NS + number % 16
+            copy.write(message.topic, message.cdr, in_burst, in_burst, message.sequence)
+    assert open_log(tmp_path / "bursts").rate_hz == pytest.approx(open_log(bag).rate_hz)
+
+
+def test_the_first_of_several_cameras_is_named_and_equal_images_teach_nothing(tmp_path, monkeypatch, capsys):
+    bag = write_ackermann(tmp_path / "drive", "ros2", ("/drive",), count=30, more_images=("/back/image",))
+    log = open_log(bag)
+    note = "images of /back/image, the first of /back/image, /front/image; --images chooses others"
+    assert (log.images, log.notes) == ("/back/image", (note,))
+    assert open_log(bag, LogChoice(images="/front/image")).notes == ()
+    assert open_log(write_bag(tmp_path / "ours")).notes == ()  # our own topics have an order of their own
+    said = r"expected images that differ in .*drive, got \d+ equal ones of /back/image; choose others with --images"
+    with pytest.raises(LogError, match=said):
+        frames_of(log, view_for_size(336, 188), None, "recorded")
+    pytest.importorskip("pyarrow")
+    assert advnerf(monkeypatch, "policy", "log", "export", str(bag), "-o", str(tmp_path / "set")) == 0
+    assert f"note: {note}" in capsys.readouterr().out
+
+
+def test_what_scenes_and_labels_of_a_bag_need_is_said(tmp_path):
+    ours = write_bag(tmp_path / "bag")
+    facts = read_facts(open_log(ours))
+    policy, scene, _ = facts.verdicts()
+    assert policy.why.startswith("labels by the expert at the poses;")
+    assert scene.possible
+    other = replace(facts, has_room=False, log=replace(facts.log, images="/front/image"))
+    policy, scene, _ = other.verdicts()
+    assert policy.why.startswith(
+        "labels by the expert at the poses, with --room, as no room.yaml is attached;"
+    )
+    assert not scene.possible
+    assert scene.why.endswith(
+        "reads images on /camera/image_raw or /camera/image_raw/compressed, these are on /front/image"
+    )
+
+
 def test_commands_of_another_clock_are_refused(tmp_path):
     """Most images got the steering of two seconds later."""
-    said = r"expected stamps of one clock, got those of /drive 2 s after their recording, and those of /front/image .*; set the"
+    said = r"expected stamps of one clock, got those of /drive 2 s after their recording, and those of /front/image 0 s before it; set the"
     with pytest.raises(LogError, match=said):
         open_log(write_ackermann(tmp_path / "drive", "ros2", count=60, ahead_s=2))
+    said = "got those of /front/image 0 s before their recording, and those of /drive 3 s before it"
+    with pytest.raises(LogError, match=said):
+        open_log(write_ackermann(tmp_path / "behind", "ros2", count=60, ahead_s=-3))
 
 
 def test_a_drive_whose_clocks_differ_is_answered_with_the_times(tmp_path):

@@ -17,6 +17,7 @@ from rosbags.rosbag2.writer import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zstandard import ZstdCompressor
 
+from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import make_transform, rotation_from_quaternion
 from nodes.bags.images import image_messages, image_topic
 from nodes.bags.message_definitions import as_our_message, parse_definition
@@ -147,8 +148,6 @@ def test_compressed_pictures_stand_for_images(tmp_path, writer, topic):
 
 
 def test_a_foreign_bag_is_evaluated(tmp_path):
-    from advnerf_core.driving.metrics import Horizon
-
     bag = write_ros1(tmp_path / "drive", pose_type="geometry_msgs/msg/TransformStamped")
     states = trajectory(bag, START_NS, Horizon(ticks=3, dt_s=0.1))
     # The stamp is 5 ms before the log time, so the ticks lie a twentieth of a step behind.
@@ -409,6 +408,41 @@ def test_a_clock_that_was_set_back_is_named_in_sqlite_too(tmp_path, monkeypatch,
     assert re.fullmatch(r"log time goes back by (10|9) s after message 9 as recorded", step)
     assert not advnerf(monkeypatch, "bag", "info", str(bag))
     assert f"{step}: the recorder's clock was set back" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("back_ms", [400, 1000, 3000])
+def test_poses_without_numbers_whose_clock_was_set_back_are_not_evaluated(tmp_path, back_ms):
+    """SQLite has no numbers of the publisher: the order in which the messages were written tells it."""
+    bag = write_rosbag2(tmp_path / "drive", StoragePlugin.SQLITE3)
+    trajectory(bag, START_NS, Horizon(ticks=3, dt_s=0.1))
+    with sqlite3.connect(bag / "drive.db3") as database:
+        shift = f"UPDATE messages SET timestamp = timestamp - {back_ms * 10**6} WHERE id > 9"
+        database.execute(shift)
+    said = r"in the order of the drive, got log times that go back by [\d.]+ s as they were written; the recorder's clock was set back"
+    with pytest.raises(BagError, match=said):
+        trajectory(bag, START_NS, Horizon(ticks=3, dt_s=0.1))
+
+
+@pytest.mark.parametrize(
+    ("form", "cure"),
+    [
+        ("ros1", r"rosbag reindex \S+drive\.bag"),
+        ("sqlite", r"sqlite3 \S+ \.recover \| sqlite3 .* ros2 bag reindex"),
+    ],
+)
+def test_a_bag_of_another_format_that_was_cut_is_told_what_rebuilds_it(
+    tmp_path, monkeypatch, capsys, form, cure
+):
+    if form == "ros1":
+        file = write_ros1(tmp_path / "drive")
+    else:
+        file = write_rosbag2(tmp_path / "drive", StoragePlugin.SQLITE3) / "drive.db3"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    for command in ("info", "repair"):
+        assert advnerf(monkeypatch, "bag", command, str(file))
+        error = capsys.readouterr().err
+        assert re.search(f"cannot be read: .*; .*{cure}", error)
+        assert "rosbags-convert" not in error
 
 
 def split_sqlite(folder):
