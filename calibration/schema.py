@@ -204,17 +204,18 @@ class ResponseSection(StrictModel):
     speed_delay_s: LagS = Field(ge=0.0)
     speed_lag_s: LagS = Field(ge=0.0)
 
-    def attack_dynamics(self) -> dict[str, float]:
-        """The section ``dynamics`` of an attack request: delay from image to wheels, lag and, if known, slew."""
-        found = {
+    def attack_dynamics(self, driver_radps: float) -> dict[str, float]:
+        """The section ``response`` of an attack: delay from image to wheels, lag, and the slower rate of the wheels and of the motor node.
+
+        Args:
+            driver_radps: Limit of the motor node, ``limits.steering_rate_radps``: commands in a bag are those before it [rad/s].
+        """
+        wheels_radps = driver_radps if self.steering_slew_radps is None else self.steering_slew_radps
+        return {
             "delay_s": round(self.pipeline_delay_s + self.steering_delay_s, 4),
             "lag_s": round(self.steering_lag_s, 4),
+            "slew_radps": round(min(wheels_radps, driver_radps), 3),
         }
-        return (
-            found
-            if self.steering_slew_radps is None
-            else {**found, "slew_radps": round(self.steering_slew_radps, 3)}
-        )
 
 
 class VehicleCalibration(Calibration):

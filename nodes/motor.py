@@ -71,8 +71,8 @@ class MotorConfig(StrictModel):
     brake_ramp_s: float = Field(default=0.1, ge=0.0, le=0.5)
     brake_hold_s: float = Field(default=1.0, ge=0.5, le=60.0)
     link_timeout_s: LagS = Field(default=0.2, gt=0.0)
-    controller_timeout_ms: int = Field(default=1000, gt=0, le=5000)
-    controller_brake_current_a: float = Field(default=0.0, ge=0.0)
+    controller_timeout_ms: int = Field(default=250, gt=0, le=5000)
+    controller_brake_current_a: float = Field(default=20.0, ge=0.0)
     steering_check: Literal["required", "unless_twin", "never"] = "unless_twin"
     steering_angle_rad: float = Field(default=0.2, gt=0.0, le=0.4)
     steering_hold_s: float = Field(default=4.0, ge=1.0)
@@ -156,6 +156,10 @@ class MotorNode(Node):
             return self._diagnostics(now, at_once=True)
         drive = message.drive
         action = self._gate.command(float(drive.speed), float(drive.steering_angle), info, now.mono_ns, age_s)
+        # The safety node waits for this node's status before it arms; a launch file may have left it out there.
+        if isinstance(action, Drive) and (missing := self._watch.missing()):
+            self._gate.latch(missing, now.mono_ns)
+            action = self._gate.tick(now.mono_ns)
         if isinstance(action, Drive):
             self._origin_stamp_ns = stamp_ns(message)
         return self._act(action, now, first=True)

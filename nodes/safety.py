@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from advnerf_core.strict import LagS, LengthM, RightAngleRad, SpeedMps, StrictModel
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from hardware.cameras.interface import RECORDED
-from nodes.control.arming import Arming, ArmingLimits
+from nodes.control.arming import MAX_SPEED_MPS, Arming, ArmingLimits
 from nodes.control.arming_gates import ClockGate, HandGate
 from nodes.control.arming_requests import ArmRequests
 from nodes.control.pose_check import MotionBounds, PoseCheck, PoseGate
@@ -87,7 +87,7 @@ class SafetyConfig(StrictModel):
     clock_offset_limit_s: float = Field(default=0.03, gt=0.0, le=0.1)
     clock_error_limit_s: LagS = Field(default=0.1, gt=0.0)
     clock_peers: tuple[str, ...] = ()
-    max_speed_mps: SpeedMps = Field(default=1.0, gt=0.0)
+    max_speed_mps: SpeedMps = Field(default=MAX_SPEED_MPS, gt=0.0)
     max_steering_rad: RightAngleRad = Field(default=0.6, gt=0.0)
     drive_age_limit_s: float = Field(default=0.22, gt=0.0, le=0.25)
     image_age_limit_s: float = Field(default=0.25, gt=0.0, le=0.3)

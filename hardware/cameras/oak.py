@@ -46,7 +46,6 @@ class OakSource(Source):
     exposure_us: int | None = None
     iso: int | None = None
     white_balance_k: int | None = None
-    repeats: int = Field(default=15, ge=0)
 
     @model_validator(mode="after")
     def _possible(self) -> OakSource:

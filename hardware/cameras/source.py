@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from advnerf_core.strict import StrictModel
-from hardware.cameras.interface import Camera
+from hardware.cameras.interface import RECORDED, Camera
 from hardware.cameras.steady import SteadyCamera
 from hardware.cameras.v4l2.controls import Controls
 
@@ -20,11 +20,11 @@ class Source(StrictModel, ABC):
 
     Attributes:
         stall_s: Time without a frame after which the device is reopened [s].
-        repeats: Number of identical images in a row that count as a stall; 0 for never.
+        repeats: Number of identical images in a row after which the device is reopened; each is withheld. 0 for never.
     """
 
     stall_s: float = Field(default=1.0, gt=0.0)
-    repeats: int = Field(default=0, ge=0)
+    repeats: int = Field(default=15, ge=0)
 
     @abstractmethod
     def camera(self) -> Camera:
@@ -32,8 +32,9 @@ class Source(StrictModel, ABC):
 
     def steady(self) -> SteadyCamera:
         """Make the camera with automatic reconnection."""
-        stall_s = max(self.stall_s, 3.0 * self.period_s())
-        return SteadyCamera(self.camera(), stall_s, max(5.0, stall_s), self.repeats)
+        stall_s, camera = max(self.stall_s, 3.0 * self.period_s()), self.camera()
+        may_repeat = "repeats" not in self.model_fields_set and RECORDED in camera.counters()
+        return SteadyCamera(camera, stall_s, max(5.0, stall_s), 0 if may_repeat else self.repeats)
 
     def period_s(self) -> float:
         """Time between two frames if the configuration has a rate, so that a slow rate is not a stall [s]."""

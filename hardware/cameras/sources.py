@@ -47,7 +47,6 @@ class V4l2Source(ControlledSource):
     size: tuple[Positive, Positive] | None = None
     exposure_us: float | None = None
     gain: int | None = None
-    repeats: int = Field(default=15, ge=0)
 
     @model_validator(mode="after")
     def _possible(self) -> V4l2Source:
@@ -74,6 +73,7 @@ class SocketSource(Source):
     """
 
     kind: Literal["socket"] = "socket"
+    repeats: int = Field(default=0, ge=0)  # a simulated car that stands sees one image
     path: Path
 
     def camera(self) -> SocketCamera:

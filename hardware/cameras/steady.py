@@ -16,7 +16,8 @@ class SteadyCamera:
     Args:
         stall_s: Time without a frame after which it is reopened [s].
         first_frame_s: The same time for the first frame after opening [s].
-        repeats: Number of identical images in a row that count as a stall; 0 for never. Sensor noise makes real images differ.
+        repeats: Number of identical images in a row that count as a stall; 0 for never. Sensor noise makes real images differ, so that each
+            is withheld: the car must not steer by it for as long as it takes to count them.
         pauses_s: First and longest pause before another attempt, doubled each time [s].
 
     Attributes:
@@ -55,7 +56,7 @@ class SteadyCamera:
                 self._open()
             frame = self.camera.read(timeout_s)
             self._watch(frame)
-            return frame
+            return None if self._same else frame
         except HardwareError as error:
             self._give_up(str(error))
             return None

@@ -247,9 +247,11 @@ class Vesc:
                 if isinstance(reply, kind):
                     return reply
             time.sleep(0.001)
-        raise LinkTimeout(
-            f"expected {kind.__name__} from {self.port} within {timeout_s} s, got nothing; is this a VESC, and is it powered?"
-        )
+        strange = self._decoder.left_over
+        got = "nothing; is this a VESC, and is it powered?"
+        if strange:
+            got = f"{strange} bytes that are no frames of a VESC; is it another device, or at another baud rate?"
+        raise LinkTimeout(f"expected {kind.__name__} from {self.port} within {timeout_s} s, got {got}")
 
     def _brake_to_standstill(self, brake_s: float) -> None:
         deadline = time.monotonic() + brake_s

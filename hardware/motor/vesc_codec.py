@@ -108,6 +108,11 @@ class FrameDecoder:
         """Whether bytes wait for the rest of their frame."""
         return bool(self._buffer)
 
+    @property
+    def left_over(self) -> int:
+        """Number of bytes so far outside of whole frames."""
+        return self.skipped_bytes + len(self._buffer)
+
     def _search(self, patient: bool) -> list[bytes]:
         payloads = []
         while self._buffer:

@@ -249,7 +249,8 @@ def vehicle(
             "do its wheels slip? The speed gain is between the two, and its standard deviation does not contain this"
         )
     if new.response is not None:
-        values = ", ".join(f"{key}: {value}" for key, value in new.response.attack_dynamics().items())
+        found = new.response.attack_dynamics(new.limits.steering_rate_radps)
+        values = ", ".join(f"{key}: {value}" for key, value in found.items())
         print(f"for an experiment:\nattack: {{response: {{{values}}}}}")
 
 

@@ -43,7 +43,7 @@ from nodes.cli.panels import in_panels
 from nodes.runtime.extras import installs
 from nodes.runtime.options import CommandGroup
 from nodes.runtime.terminal import FAILURE_EXIT, LaunchFile, Overrides, print_table, say_error, table
-from nodes.runtime.termination import ends_in_order
+from nodes.runtime.termination import ending_signals, ends_in_order
 
 if TYPE_CHECKING:
     from nodes.launching.launch import Launch
@@ -152,8 +152,13 @@ def launch(
     run_dir = run_dir or Path("runs") / f"{plan.launch.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     require_utf8(run_dir.absolute())
     _refuse(_cheap_problems(plan))
-    started = Launch(file, overrides or [], run_dir, lambda line: print(f"[launch] {line}", flush=True), host)
+    started = Launch(file, overrides or [], run_dir, _say, host)
     _watch_launch(started, duration_s)
+
+
+def _say(line: str) -> None:
+    with contextlib.suppress(OSError):  # a closed terminal must not keep the launch from stopping the car
+        print(f"[launch] {line}", flush=True)
 
 
 def _watch_launch(started: Launch, duration_s: float | None) -> None:
@@ -164,9 +169,9 @@ def _watch_launch(started: Launch, duration_s: float | None) -> None:
         asked += 1
         started.request_stop(kill=asked > 1)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, *ending_signals()):
         signal.signal(number, stop)
-    print(f"[launch] {started.plan.launch.name} in {started.run_dir}", flush=True)
+    _say(f"{started.plan.launch.name} in {started.run_dir}")
     started.start()
     try:
         if started.wait(duration_s) is None:

@@ -19,6 +19,7 @@ from nodes.runtime.twin_port import is_twin
 from nodes.runtime.wire import MessageInfo
 
 OPERATOR = "operator"
+MAX_SPEED_MPS = 1.0  # fastest command without another limit
 _ALIVE_STATES = ("ready", "active")
 
 

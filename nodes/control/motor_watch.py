@@ -48,6 +48,7 @@ class ControllerWatch:
         self.peer = ""
         self._firmware: FirmwareVersion | None = None
         self._checked_with: FirmwareVersion | None = None
+        self._swapped = False
         self._asks_left = _SETTINGS_ASKS
 
     def connected(self, firmware: FirmwareVersion, on_twins_port: bool) -> None:
@@ -61,7 +62,10 @@ class ControllerWatch:
         self.peer = peer_text(str(firmware), firmware.hardware_name, on_twins_port)
         self._firmware, self._asks_left = firmware, _SETTINGS_ASKS
         if self._checked_with not in (None, firmware):
+            self._swapped = True
             self.check.forget(f"{self._checked_with} was replaced by {firmware}")
+        elif self._swapped:
+            self.check.forget(f"{firmware} is back, after another controller was in its place")
 
     def poll(self, vesc: Vesc) -> None:
         """Request telemetry, and the settings until they are known."""
@@ -87,7 +91,7 @@ class ControllerWatch:
 
     def start_check(self, mono_ns: int) -> None:
         """Start the steering check."""
-        self._checked_with = self._firmware
+        self._checked_with, self._swapped = self._firmware, False
         self.check.start(mono_ns)
 
     def obey(self, message: Any, refusal: str, mono_ns: int) -> None:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from advnerf_core.documents import read_yaml
 from calibration.schema import BY_CONSTRUCTION
+from nodes.control.arming import MAX_SPEED_MPS
 from nodes.launching.launch_file import Plan
 from nodes.runtime.twin_port import PORT
 
 _TWIN, _MOTOR, _SAFETY = "nodes.twin", "nodes.motor", "nodes.safety"
+_COMMANDING = ("nodes.expert", "nodes.policy", "nodes.teleop", "nodes.calibration_drive")
+# Nodes whose messages are conditions of arming only if the safety node waits for them.
+_CONDITIONS = (
+    (_MOTOR, "motor", "the car drives without a check of its time-out, its wheels and its telemetry"),
+    ("nodes.camera", "camera", "the car drives on after its camera has died"),
+)
 
 
 def mixtures(plan: Plan) -> dict[str, str]:
@@ -36,11 +45,43 @@ def mixtures(plan: Plan) -> dict[str, str]:
             "set params.calibration to the folder of what was measured"
         )
     guard = None if safety is None else plan.documents[safety].data
+    if safety is not None and isinstance(guard, dict):
+        if unwatched := _unwatched(guard, of):
+            found[safety] = f"{plan.documents[safety].place(('nodes',))}: {unwatched}"
+        found |= _too_fast(plan, guard)
     if safety is not None and isinstance(guard, dict) and guard.get("vehicle") not in (None, vehicle):
         found[safety] = (
             f"{plan.documents[safety].place(('vehicle',))}: expected one vehicle file for {safety} and {motor}, got {guard['vehicle']} and {vehicle}; the "
             "limits of one car do not hold for another"
         )
+    return found
+
+
+def _unwatched(guard: dict[str, Any], of: Mapping[str, str]) -> str:
+    """What is wrong with the nodes that the safety node waits for; empty if the motor and the camera are among them."""
+    named = guard.get("nodes")
+    for module, name, why in _CONDITIONS:
+        if module not in of:
+            continue
+        if of[module] != name:
+            return f"expected the node of {module} to be called {name}, as the safety node knows it, got {of[module]}; rename it"
+        if isinstance(named, list) and name not in named:
+            return f"expected {name} among safety.nodes, got {', '.join(map(str, named)) or 'none'}: without it, {why}; add it"
+    return ""
+
+
+def _too_fast(plan: Plan, guard: dict[str, Any]) -> dict[str, str]:
+    """Nodes that command the car faster than the safety node lets it drive: it would never be armed, or stop at their first command."""
+    limit_mps, found = guard.get("max_speed_mps", MAX_SPEED_MPS), dict[str, str]()
+    for name, entry in plan.nodes.items():
+        document = plan.documents[name]
+        wanted = document.data.get("speed_mps") if isinstance(document.data, dict) else None
+        numbers = all(isinstance(each, int | float) for each in (wanted, limit_mps))
+        if entry.module in _COMMANDING and numbers and wanted > limit_mps:
+            found[name] = (
+                f"{document.place(('speed_mps',))}: expected {name}.speed_mps of at most safety.max_speed_mps, {limit_mps:g} m/s, got {wanted:g}: the safety "
+                "node would stop the car at the first command; correct either"
+            )
     return found
 
 

@@ -429,6 +429,11 @@ def _taken(topic: Topic, run_dir: Path, owners: list[str]) -> str:
             f"{taken} the node {', '.join(nodes)} (process {', '.join(owners)}). Leave the topic out here (bag play: --topics, --remap), "
             f"start the launch without that node (--set {nodes[0]}.if=false), or use another --folder"
         )
+    if topic.name.startswith(STATUS_PREFIX):
+        return (
+            f"expected one node {topic.name.removeprefix(STATUS_PREFIX)} in {run_dir}, got another one beside process {', '.join(owners)}; "
+            "end that one, or use another --folder"
+        )
     return (
         f"{taken} process {', '.join(owners)}: another launch uses the same endpoints. "
         "Stop it, or use another --folder"

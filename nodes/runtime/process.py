@@ -23,6 +23,7 @@ from nodes.runtime.errors import BagError, ConfigError, NodeFinished, TakenError
 from nodes.runtime.loop import NodeLoop
 from nodes.runtime.node import FAULT, STARTING, Node, NodeContext
 from nodes.runtime.prepare import prepare_process
+from nodes.runtime.termination import ending_signals
 from nodes.runtime.topics import status_topic
 
 C = TypeVar("C", bound=BaseModel)
@@ -33,12 +34,12 @@ _WRONG_REQUEST = (BagError, ConfigError, TopicError)
 
 
 class _Signals:
-    """Handler of SIGINT and SIGTERM, which end the loop or, before the loop exists, the process."""
+    """Handler of SIGINT and of `ending_signals`, which end the loop or, before the loop exists, the process."""
 
     def __init__(self) -> None:
         self._loop: NodeLoop | None = None
         self._previous = {
-            number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)
+            number: signal.signal(number, self._handle) for number in (signal.SIGINT, *ending_signals())
         }
 
     def attach(self, loop: NodeLoop) -> None:
@@ -51,7 +52,7 @@ class _Signals:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        del number, frame  # both signals have the same effect
+        del number, frame  # all signals have the same effect
         if self._loop is None:
             raise SystemExit(0)
         self._loop.stop()
@@ -63,7 +64,7 @@ def run_node(
     run_dir: Path,
     on_loop: Callable[[NodeLoop], None] | None = None,
 ) -> int:
-    """Run a node until SIGINT, SIGTERM, `NodeFinished` or an exception.
+    """Run a node until SIGINT, one of `ending_signals`, `NodeFinished` or an exception.
 
     Args:
         build: Makes the node and opens its devices.

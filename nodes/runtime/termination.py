@@ -1,4 +1,4 @@
-"""Orderly termination on SIGTERM."""
+"""Orderly termination on signals: on SIGTERM, and on a closed terminal."""
 
 from __future__ import annotations
 
@@ -19,11 +19,21 @@ def wait_or_kill(process: subprocess.Popen[Any], wait_s: float) -> None:
         process.wait()
 
 
+def ending_signals() -> tuple[signal.Signals, ...]:
+    """SIGTERM, and what a closed terminal, a lost ssh connection and Ctrl-\\ send; without those that this process was told to ignore (nohup)."""
+    others = (signal.SIGHUP, signal.SIGQUIT)
+    return (signal.SIGTERM, *(each for each in others if signal.getsignal(each) is not signal.SIG_IGN))
+
+
 @contextlib.contextmanager
 def ends_in_order() -> Iterator[None]:
-    """Treat SIGTERM like Ctrl-C, so that open resources, such as a CARLA world or a live launch, are closed first."""
-    before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    """Treat `ending_signals` like Ctrl-C, so that open resources, such as a CARLA world or a live launch, are closed first."""
+    before = {
+        number: signal.signal(number, lambda number, frame: sys.exit(128 + number))
+        for number in ending_signals()
+    }
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

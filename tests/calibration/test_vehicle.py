@@ -247,6 +247,6 @@ def test_the_file_round_trip_and_what_the_attack_takes_from_it(good, gains, tmp_
     save_calibration(calibration, tmp_path / "vehicle.yaml")
     loaded = load_calibration(VehicleCalibration, tmp_path / "vehicle.yaml")
     assert loaded == calibration
-    dynamics = ActuatedAckermann(loaded.wheelbase_m, 0.8, 0.1, **loaded.response.attack_dynamics())
+    dynamics = ActuatedAckermann(loaded.wheelbase_m, 0.8, 0.1, **loaded.response.attack_dynamics(3.2))
     assert dynamics.delay_s == pytest.approx(0.07, abs=0.012)
     assert loaded.vehicle_gains.servo(0.0) == pytest.approx(CAR.true_servo_offset, rel=0.01)

@@ -1,9 +1,12 @@
 import errno
+import fcntl
 import os
+import pty
 import re
 import signal
 import subprocess
 import sys
+import termios
 import textwrap
 import time
 from pathlib import Path
@@ -22,6 +25,7 @@ from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import encode, pose_message
 from nodes.runtime.node import NodeContext
+from nodes.runtime.termination import ending_signals
 from tests.support.waiting import wait_for
 
 SENDER = """
@@ -94,6 +98,41 @@ def running(folder):
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=600)
     assert (process.returncode, but_for_code(errors)) == (0, "")
+
+
+def test_a_launch_whose_terminal_is_closed_ends_in_order(folder):
+    """As a lost ssh connection does: a launch that is killed by it leaves the stop of the car to its motor controller."""
+    master, slave = pty.openpty()
+
+    def in_the_terminal():
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    words = ["launch", str(folder / "little.launch.yaml"), "--folder", str(folder / "closed")]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "nodes.cli", *words],
+        env=environment(folder),
+        stdin=slave,
+        stdout=slave,
+        stderr=slave,
+        start_new_session=True,
+        preexec_fn=in_the_terminal,
+    )
+    os.close(slave)
+    said = b""
+    while b"all nodes are ready" not in said:
+        said += os.read(master, 4096)
+    os.close(master)
+    assert process.wait(timeout=600) == 0
+
+
+def test_what_a_program_was_told_to_ignore_does_not_end_it(monkeypatch):
+    """``nohup`` starts it with SIGHUP ignored."""
+    handlers = {signal.SIGHUP: signal.SIG_DFL, signal.SIGQUIT: signal.SIG_DFL}
+    monkeypatch.setattr(signal, "getsignal", handlers.__getitem__)
+    assert ending_signals() == (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+    handlers[signal.SIGHUP] = signal.SIG_IGN
+    assert ending_signals() == (signal.SIGTERM, signal.SIGQUIT)
 
 
 def but_for_code(errors):

@@ -106,6 +106,18 @@ MIXED = {
         ["twin.if=false", "motor.port=/dev/vesc"],
         r"expected a measured motor\.calibration for the controller at /dev/vesc, got .*twin/vehicle\.yaml, the simulated car's",
     ),
+    "a motor that the safety node does not wait for": (
+        ["safety.nodes=[camera, vicon, policy]"],
+        r"safety\.nodes|nodes: expected motor among safety\.nodes, got camera, vicon, policy: without it, the car drives without a check",
+    ),
+    "a camera that the safety node does not wait for": (
+        ["safety.nodes=[vicon, policy, motor]"],
+        r"expected camera among safety\.nodes, got vicon, policy, motor: without it, the car drives on after its camera has died",
+    ),
+    "a policy that is faster than allowed": (
+        ["policy.speed_mps=1.4"],
+        r"expected policy\.speed_mps of at most safety\.max_speed_mps, 1 m/s, got 1\.4",
+    ),
     "two cars": (
         ["safety.vehicle=other/vehicle.yaml"],
         r"expected one vehicle file for safety and motor, got other/vehicle\.yaml and .*twin/vehicle\.yaml",

@@ -23,6 +23,7 @@ from nodes.runtime.messages import drive_message, ns_from_stamp
 from nodes.runtime.node import MessageInfo
 from nodes.runtime.twin_port import claim_twins_port
 from tests.support.safety_reports import state_message
+from tests.support.stack import TIMEOUT
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
@@ -36,7 +37,9 @@ class Drives:
 
     def __init__(self, tmp_path, node_context):
         self.claim = claim_twins_port(node_context.run_dir)
-        self.emulator = VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "vesc")
+        self.emulator = VescEmulator(
+            VescEmulatorConfig(**TIMEOUT), TwinVehicle(CarConfig()), tmp_path / "vesc"
+        )
         self.config = MotorConfig(port=str(tmp_path / "vesc"), calibration=TWIN / "vehicle.yaml")
         self.node = MotorNode.build(self.config, node_context)
 
@@ -139,7 +142,7 @@ def test_motor_that_loses_its_controller_reports_it_and_comes_back_stopped(drive
     drives.run(0.1)
     assert drives.node.status()[0] == "fault"
     assert drives.send(0.5, 0.0) == []
-    drives.emulator = VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "vesc")
+    drives.emulator = VescEmulator(VescEmulatorConfig(**TIMEOUT), TwinVehicle(CarConfig()), tmp_path / "vesc")
     drives.run(0.8)
     assert drives.send(0.5, 0.0) == []
     assert set(drives.names()) == {"SET_CURRENT_BRAKE"}

@@ -25,6 +25,7 @@ from nodes.runtime.twin_port import claim_twins_port, is_twin, is_twins_port
 from tests.support.faulty_devices import FaultyVescEmulator
 from tests.support.messages import filled
 from tests.support.safety_reports import state_message
+from tests.support.stack import TIMEOUT
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
@@ -39,10 +40,11 @@ class Car:
     def __init__(self, tmp_path, config=None, twins_port=True, **vesc):
         self.claim = claim_twins_port(tmp_path) if twins_port else None
         self.emulator = FaultyVescEmulator(
-            VescEmulatorConfig(**{"hardware_name": "60", **vesc}), link=tmp_path / "vesc"
+            VescEmulatorConfig(**{"hardware_name": "60", **TIMEOUT, **vesc}), link=tmp_path / "vesc"
         )
         config = MotorConfig(port=str(tmp_path / "vesc"), calibration=VEHICLE, **(config or {}))
         self.node = MotorNode.build(config, NodeContext("motor", tmp_path, CLOCK))
+        self.emulator_folder = tmp_path
         self.start = CLOCK.now()
         self.pose = (0.0, 0.0, 0.0)
         self.outs = []
@@ -133,10 +135,23 @@ def test_a_twin_at_another_port_of_its_run_is_not_the_twin(make, tmp_path):
 
 
 def test_a_time_out_that_is_too_long_keeps_it_from_arming(make):
-    car = make({"steering_check": "never", "controller_timeout_ms": 250, "controller_brake_current_a": 20.0})
+    """As a controller is delivered, which rolls on for a second and then coasts."""
+    car = make({"steering_check": "never"}, timeout_ms=1000.0, timeout_brake_current_a=0.0)
     car.settle(lambda: "set-timeout" in car.node.status()[1])
     assert car.node.status()[0] == "starting"
     assert "at most 250 ms with at least 20 A, it is 1000 ms with 0 A" in car.node.status()[1]
+    since = CLOCK.now().mono_ns
+    drive(car, 0.0)
+    drive(car, 0.5)  # from a safety node that does not wait for this one
+    assert "set-timeout" in car.node._gate.reason
+    assert not [each for each in car.emulator.events(since) if each.name == "SET_RPM" and each.value]
+    accepted = {"controller_timeout_ms": 1000, "controller_brake_current_a": 0.0}
+    car.node.close()
+    car.node = MotorNode.build(
+        MotorConfig(port=car.emulator.port, calibration=VEHICLE, steering_check="never", **accepted),
+        NodeContext("motor", car.emulator_folder, CLOCK),
+    )
+    car.settle(lambda: car.node.status()[1] == "latched: waiting for the safety node")
 
 
 def test_a_time_out_switched_off_is_never_good_enough(make):
@@ -307,7 +322,7 @@ def test_a_repeated_request_for_the_check_is_obeyed_once_and_answered_every_time
 
 
 def test_command_line(tmp_path):
-    with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "vesc") as emulator:
+    with VescEmulator(VescEmulatorConfig(**TIMEOUT), TwinVehicle(CarConfig()), tmp_path / "vesc") as emulator:
         port = ["--vesc", str(tmp_path / "vesc")]
         shown = CliRunner().invoke(app, ["car", "motor", "info", *port])
         assert shown.exit_code == 0, shown.output
@@ -333,7 +348,7 @@ def test_a_person_confirms_over_the_bus(tmp_path, answer, code, text):
     config = {"port": str(tmp_path / "vesc"), "calibration": str(VEHICLE), "steering_hold_s": 1.0}
     (tmp_path / "motor.json").write_text(json.dumps(config))
     car = TwinVehicle(CarConfig())
-    with VescEmulator(VescEmulatorConfig(hardware_name="60"), car, tmp_path / "vesc") as emulator:
+    with VescEmulator(VescEmulatorConfig(hardware_name="60", **TIMEOUT), car, tmp_path / "vesc") as emulator:
         command = [
             sys.executable,
             "-m",

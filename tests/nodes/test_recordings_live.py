@@ -18,7 +18,7 @@ from nodes.linking.keys import DRIVE, KeyFolder
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import drive_message, pose_message
 from tests.support.harmful_recording import EVERY, recorded
-from tests.support.stack import CALIBRATION, REPOSITORY
+from tests.support.stack import CALIBRATION, REPOSITORY, TIMEOUT
 from tests.support.virtual_stack import teleop_message
 from tests.support.waiting import wait_for
 
@@ -42,7 +42,7 @@ class Car:
         self.folder, self.hand, self.hand_age_ns = folder, None, 0
         self.armed, self.motor, self._processes, self._stopping = False, "", {}, False
         self.emulator = VescEmulator(
-            VescEmulatorConfig(hardware_name="60"), TwinVehicle(CarConfig()), folder / "vesc"
+            VescEmulatorConfig(hardware_name="60", **TIMEOUT), TwinVehicle(CarConfig()), folder / "vesc"
         )
         self._thread = threading.Thread(target=self._run)
         self._thread.start()

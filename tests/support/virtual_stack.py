@@ -22,7 +22,7 @@ from nodes.runtime.node import MessageInfo, Out
 from nodes.runtime.requests import RequestIdentity
 from nodes.safety import SafetyConfig, SafetyNode
 from tests.support.messages import filled
-from tests.support.stack import CALIBRATION
+from tests.support.stack import CALIBRATION, TIMEOUT
 
 MS, S = 10**6, 10**9
 REAL_NS = 1_900_000_000 * S
@@ -110,7 +110,7 @@ class VirtualStack:
         monkeypatch.setattr("hardware.motor.vesc.time", self)
         self.car = TwinVehicle(CarConfig())
         self.car.reset(*START_M, 0.0)
-        self.firmware = VescFirmware(VescEmulatorConfig(hardware_name=hardware_name), self.car)
+        self.firmware = VescFirmware(VescEmulatorConfig(hardware_name=hardware_name, **TIMEOUT), self.car)
         self.config = SafetyConfig(room=ROOM, vehicle=VEHICLE, nodes=NODES, drivers=drivers)
         vehicle = load_calibration(VehicleCalibration, VEHICLE)
         room = self.config.limits(_room())

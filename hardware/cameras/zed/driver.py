@@ -42,7 +42,6 @@ class ZedSource(ControlledSource):
     size: tuple[Positive, Positive] = (336, 188)
     exposure_percent: float | None = None
     gain_raw: int | None = None
-    repeats: int = Field(default=15, ge=0)
 
     @model_validator(mode="after")
     def _possible(self) -> ZedSource:

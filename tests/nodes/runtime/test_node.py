@@ -254,7 +254,10 @@ def test_second_node_of_a_name_ends_before_it_opens_its_device(tmp_path, capsys)
         built = []
         assert run_node(lambda context: built.append(context), "echo", tmp_path) == 1
         assert built == []
-    assert "another launch uses the same endpoints" in capsys.readouterr().err
+    assert (
+        f"expected one node echo in {tmp_path}, got another one beside process {os.getpid()}; end that one"
+        in capsys.readouterr().err
+    )
 
 
 NODE_SCRIPT = """
@@ -288,12 +291,15 @@ def script(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_signal_ends_a_process_cleanly(script, tmp_path, number):
     with Bus(tmp_path) as bus:
         bus.subscribe("/status/counter")
         process = subprocess.Popen(
-            [sys.executable, script, "--folder", tmp_path], stdout=subprocess.PIPE, text=True
+            [sys.executable, script, "--folder", tmp_path],
+            stdout=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),  # the tests may run under nohup
         )
         hear(bus, "/status/counter", accept=lambda m: m.state == "active")
         process.send_signal(number)
