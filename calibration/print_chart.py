@@ -95,7 +95,7 @@ def fit_printer(rgb: Rgb, lens: Intrinsics, record: PrintRecord) -> DisplayFit:
     seen = patch_colours(
         rgb,
         lens,
-        pose.T_camera_from_face,
+        pose.laid,
         record.picture_m,
         (shape[0], shape[1]),
         {number: record.markers[number] for number in pose.seen},

@@ -12,12 +12,13 @@ from scipy.optimize import minimize_scalar
 
 from advnerf_core.attack.printing.frame import CELLS, marker_cells
 from advnerf_core.attack.printing.poster import MM_PER_M, Printable
-from advnerf_core.geometry import Array, transform_points
+from advnerf_core.geometry import Array
 from advnerf_core.plain import PlainData
 from advnerf_core.scene.colour import fit_colour_map
 from advnerf_core.srgb import to_display
 from calibration.degeneracy import DegenerateDataError
 from calibration.print_markers import linear
+from calibration.print_model import LaidPrint
 from calibration.schema import Intrinsics
 
 Rgb = NDArray[np.uint8]
@@ -59,9 +60,9 @@ class Light:
         return np.asarray(_terms(points_m, len(self.white)) @ self.white)
 
 
-def sampled(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, points_m: Array) -> Array:
+def sampled(rgb: Rgb, lens: Intrinsics, laid: LaidPrint, points_m: Array) -> Array:
     """Colours ``[..., 3]`` in 0..255 of a photograph ``[H, W, 3]`` at points ``[..., 3]`` of a print; NaN outside of it."""
-    pixels = _pixels(transform_points(T_camera_from_face, points_m.reshape(-1, 3)), lens)
+    pixels = _pixels(laid.in_camera(points_m.reshape(-1, 3)), lens)
     where = (pixels - 0.5).astype(np.float32)
     found = np.empty((len(where), 3))
     image = rgb.astype(np.float32)
@@ -88,7 +89,7 @@ def _inside(pixels: Array, lens: Intrinsics) -> NDArray[np.bool_]:
     return np.asarray(((pixels >= 0.5) & (pixels <= np.array([lens.width, lens.height]) - 0.5)).all(axis=1))
 
 
-def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: Mapping[int, Array]) -> Light:
+def light_on(rgb: Rgb, lens: Intrinsics, laid: LaidPrint, corners_m: Mapping[int, Array]) -> Light:
     """The light on a print, from its seen markers and the paper around them.
 
     At points of each marker, the light is that of white paper and of black ink, mixed as the markers' cells are in the photograph's pixels. So the
@@ -96,7 +97,7 @@ def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: M
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        T_camera_from_face: Pose ``[4, 4]`` of the print in nominal units.
+        laid: How the print lies before the camera.
         corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
 
     Raises:
@@ -105,10 +106,10 @@ def light_on(rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, corners_m: M
     places, drawn, seen = [], [], []
     for number, corners in corners_m.items():
         points = _over_marker(corners)
-        pixel = _pixel(lens, T_camera_from_face, points)
+        pixel = _pixel(lens, laid, points)
         white = np.pad(marker_cells(number) / 255.0, _PAPER_CELLS, constant_values=1.0)
         drawn.append((white.repeat(_FINER, 0).repeat(_FINER, 1), pixel))
-        linear_seen = linear(sampled(rgb, lens, T_camera_from_face, points))
+        linear_seen = linear(sampled(rgb, lens, laid, points))
         seen.append(_blurred(linear_seen, _BLUR_PX * pixel).reshape(-1, 3))
         places.append(points.reshape(-1, 3))
     light, points = np.concatenate(seen), np.concatenate(places)
@@ -191,7 +192,7 @@ def encoded(light: Array) -> Array:
 def patch_colours(
     rgb: Rgb,
     lens: Intrinsics,
-    T_camera_from_face: Array,
+    laid: LaidPrint,
     picture_m: tuple[float, float],
     shape: tuple[int, int],
     corners_m: Mapping[int, Array],
@@ -200,14 +201,14 @@ def patch_colours(
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        T_camera_from_face: Pose ``[4, 4]`` of the chart in nominal units.
+        laid: How the chart lies before the camera.
         picture_m: Width and height of all patches [m].
         corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
 
     Raises:
         DegenerateDataError: The light is uneven, or a patch is not in the photograph.
     """
-    light = light_on(rgb, lens, T_camera_from_face, corners_m)
+    light = light_on(rgb, lens, laid, corners_m)
     if light.uneven > _MOST_UNEVEN:
         raise DegenerateDataError(
             f"expected even light on the chart, got a change of {100 * light.uneven:.0f} %: turn it, or move the lamp"
@@ -217,7 +218,7 @@ def patch_colours(
         -1, 3
     )
     points = centres[:, :, None] + inside
-    seen = sampled(rgb, lens, T_camera_from_face, points)
+    seen = sampled(rgb, lens, laid, points)
     if not np.isfinite(seen).all():
         raise DegenerateDataError("expected the whole chart in the photograph, got patches outside; go back")
     even = evenly_lit(seen, light, points)
@@ -263,23 +264,23 @@ class PrintColours:
 
 
 def print_colours(
-    rgb: Rgb, lens: Intrinsics, T_camera_from_face: Array, sheet: Printable, corners_m: Mapping[int, Array]
+    rgb: Rgb, lens: Intrinsics, laid: LaidPrint, sheet: Printable, corners_m: Mapping[int, Array]
 ) -> PrintColours:
     """The colours of a print in a photograph, and their difference to what was printed.
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        T_camera_from_face: Pose ``[4, 4]`` of the print in nominal units.
+        laid: How the print lies before the camera.
         corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
 
     Raises:
         DegenerateDataError: The exposure does not show colours, or too much is outside the photograph.
     """
-    light = light_on(rgb, lens, T_camera_from_face, corners_m)
+    light = light_on(rgb, lens, laid, corners_m)
     width_mm, height_mm = sheet.sheet_mm
     fine = _CELLS * _FINER
     points = picture_points((width_mm / MM_PER_M, height_mm / MM_PER_M), fine, fine)
-    raw = sampled(rgb, lens, T_camera_from_face, points)
+    raw = sampled(rgb, lens, laid, points)
     printed = sheet.pixels((0.0, 0.0, width_mm, height_mm), (fine, fine))
     wanted, seen = _coarse(printed), _coarse(raw)
     hidden = np.asarray(~np.isfinite(seen).all(axis=-1), np.bool_)
@@ -287,7 +288,7 @@ def print_colours(
         raise DegenerateDataError(
             f"expected at least {100 * (1 - _MOST_HIDDEN):.0f} % of the print in the photograph, got {100 * (1 - hidden.mean()):.0f} %; go back"
         )
-    pixel = _pixel(lens, T_camera_from_face, points)
+    pixel = _pixel(lens, laid, points)
     resolved = encoded(_blurred(linear(raw), _BLUR_PX * pixel))
     expected = encoded(_blurred(linear(printed), light.blur_px * pixel))
     inside = (np.abs(points[..., 1:]) < 0.5 * np.array(sheet.size_m)).all(axis=-1)
@@ -310,9 +311,9 @@ def print_colours(
     )
 
 
-def _pixel(lens: Intrinsics, T_camera_from_face: Array, points_m: Array) -> float:
+def _pixel(lens: Intrinsics, laid: LaidPrint, points_m: Array) -> float:
     """A pixel of the photograph in points of a grid ``[n, n, 3]``, where the grid is finest in it."""
-    pixels = _pixels(transform_points(T_camera_from_face, points_m.reshape(-1, 3)), lens)
+    pixels = _pixels(laid.in_camera(points_m.reshape(-1, 3)), lens)
     grid = pixels.reshape((*points_m.shape[:2], 2))
     least_px = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in range(2))
     return 1.0 / max(least_px, 1.0 / len(points_m))

@@ -7,13 +7,13 @@ with a small standard deviation.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from advnerf_core.geometry import Array, Pinhole, make_transform
+from advnerf_core.geometry import Array, Pinhole, make_transform, transform_points
 
 # Places of the parameters: pose (rotation vector, translation), growth of the black, logarithm of the aspect, bend.
 POSE, GROWTH, ASPECT, BEND = slice(0, 6), 6, 7, slice(8, 11)
@@ -85,6 +85,29 @@ def corner_errors(markers: Mapping[int, Array], corners_m: Mapping[int, Array], 
         return pinhole.project(moved(p, laid)) - pixels
 
     return errors
+
+
+@dataclass(frozen=True, eq=False)
+class LaidPrint:
+    """How a print lies before the camera, with what is wrong with it: its points are not where the nominal ones of its pose are.
+
+    Attributes:
+        T_camera_from_face: Pose ``[4, 4]`` of the print's middle plane, in nominal units.
+        log_aspect: Logarithm of its aspect over the nominal one.
+        bend: As of `bend_m`.
+        half_m: `half_side` of its markers.
+    """
+
+    T_camera_from_face: Array
+    log_aspect: float = 0.0
+    bend: Array = field(default_factory=lambda: np.zeros(3))
+    half_m: float = 1.0
+
+    def in_camera(self, points_m: Array) -> Array:
+        """Points of the print ``[..., 3]``, nominal, in the camera's frame."""
+        laid = points_m * np.exp([0.0, 0.5 * self.log_aspect, -0.5 * self.log_aspect])
+        laid[..., 0] += bend_m(self.bend, points_m / self.half_m)
+        return transform_points(self.T_camera_from_face, laid.reshape(-1, 3)).reshape(points_m.shape)
 
 
 def half_side(corners_m: Mapping[int, Array]) -> float:

@@ -25,6 +25,7 @@ from calibration.print_model import (
     LEAST_NOISE_PX,
     RIGID,
     Errors,
+    LaidPrint,
     PrintFit,
     bend_m,
     corner_errors,
@@ -52,7 +53,6 @@ class PrintPose:
     """A print in a photograph. Lengths are in units of the nominal size: times the print's true scale, they are metres.
 
     Attributes:
-        T_camera_from_face: Pose ``[4, 4]`` of the print's middle plane.
         seen: Numbers of the markers that were used.
         dropped: Numbers of those that were found, and left out, because they do not lie where the others put them.
         rms_px: Root mean square distance of the corners from their projections [px].
@@ -64,9 +64,10 @@ class PrintPose:
         aspect: Width over height, as a share of the nominal ratio; 1 where the photograph does not tell it from 1.
         card_scale: True size over nominal size, by the card; None without a card.
         card_scale_sd: Standard deviation of the card's scale.
+        laid: Where its points are, with its aspect and bend.
     """
 
-    T_camera_from_face: Array
+    laid: LaidPrint
     seen: tuple[int, ...]
     dropped: tuple[int, ...]
     rms_px: float
@@ -78,6 +79,11 @@ class PrintPose:
     aspect: float
     card_scale: float | None = None
     card_scale_sd: float = 0.0
+
+    @property
+    def T_camera_from_face(self) -> Array:
+        """Pose ``[4, 4]`` of the middle plane."""
+        return self.laid.T_camera_from_face
 
     @property
     def view_angle_rad(self) -> float:
@@ -126,7 +132,7 @@ def fit_print(
     rms_m = fit.rms_px * float(np.linalg.norm(fit.values[3:6])) / pinhole.fx
     aspect = float(np.exp(fit.values[ASPECT]))
     return PrintPose(
-        fit.transform,
+        LaidPrint(fit.transform, float(fit.values[ASPECT]), fit.values[BEND], half_side(corners_m)),
         tuple(kept),
         tuple(dropped),
         fit.rms_px,

@@ -25,9 +25,10 @@ from advnerf_core.geometry import (
 )
 from calibration.print_chart import make_chart
 from calibration.print_colour import ColourError, print_colours
-from calibration.print_markers import why_none
+from calibration.print_markers import find_markers, why_none
 from calibration.print_measurement import WIDTH, of_photograph
-from calibration.print_pose import PrintPose
+from calibration.print_model import LaidPrint
+from calibration.print_pose import PrintPose, fit_print
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
@@ -127,12 +128,38 @@ def test_a_right_print_is_right_from_afar_and_another_one_is_not(camera, away_m,
     right = print_of(0)
     T = before_camera(away_m, 10, 3, 2)
     picture = photograph([(scaled(right, 1.0, 1.0, 75.0), T)], camera, light=(0.9, 0.8, 0.7))
-    error = print_colours(picture, camera, T, right, right.frame.corners_m).error
+    error = print_colours(picture, camera, LaidPrint(T), right, right.frame.corners_m).error
     assert (error.rms < 12.0, error.far_share < 0.01) == (True, True), error
     if cells == 8:  # of finer ones little more than the mean is left
         other = print_of(1)
-        wrong = print_colours(picture, camera, T, other, right.frame.corners_m).error
+        wrong = print_colours(picture, camera, LaidPrint(T), other, right.frame.corners_m).error
         assert wrong.far_share > 0.3
+
+
+@pytest.mark.parametrize("aspect", [1.0, 1.02, 0.96])
+def test_a_stretched_print_has_its_colours_and_even_light(aspect):
+    """Its points are not where the nominal ones are: beside their cells, all colours were wrong, and the light uneven."""
+    theta = np.random.default_rng(0).normal(0.0, 2.0, (8, 8, 3)).astype(np.float32)
+    sheet = poster_of(face_attack(theta=theta, size_m=(0.4, 0.4), **FACE)).with_markers()
+    picture = photograph(
+        [(scaled(sheet, aspect, 1.0, 75.0), before_camera(0.7, 10, 3, 2))], LENS, light=(0.8, 0.8, 0.8)
+    )
+    corners = sheet.frame.corners_m
+    pose = fit_print(find_markers(picture, LENS, corners), corners, LENS.pinhole)
+    assert pose.aspect == pytest.approx(aspect, abs=0.002)
+    colours = print_colours(
+        picture, LENS, pose.laid, sheet, {number: corners[number] for number in pose.seen}
+    )
+    assert colours.error.rms < 8.0
+    assert colours.error.uneven < 0.05
+    assert np.abs(colours.error.mean).max() < 3.0
+
+
+def test_points_of_a_bent_print_are_off_its_plane():
+    laid = LaidPrint(np.eye(4), 0.02, np.array([0.01, 0.0, 0.0]), 0.2)
+    edge, middle = laid.in_camera(np.array([[0.0, 0.2, 0.1], [0.0, 0.0, 0.0]]))
+    assert edge == pytest.approx([0.01 * 2.0 / 3.0, 0.2 * np.exp(0.01), 0.1 * np.exp(-0.01)])
+    assert middle == pytest.approx([-0.01 / 3.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("blur_px", [0.0, 1.2, 2.5])
@@ -142,7 +169,7 @@ def test_a_soft_photograph_has_the_colours_of_the_print(blur_px):
     sheet = poster_of(face_attack(theta=theta, size_m=(0.4, 0.4), **FACE)).with_markers()
     T, light = before_camera(0.9, 10, 3, 2), (0.9, 0.8, 0.7)
     picture = photograph([(scaled(sheet, 1.0, 1.0, 75.0), T)], LENS, light=light, blur_px=blur_px)
-    error = print_colours(picture, LENS, T, sheet, sheet.frame.corners_m).error
+    error = print_colours(picture, LENS, LaidPrint(T), sheet, sheet.frame.corners_m).error
     assert error.rms < 8.0
     assert np.abs(error.mean).max() < 6.0
     assert error.far_share < 0.01
@@ -336,7 +363,7 @@ def test_a_yaw_in_degrees_is_refused(call, measuring):
 
 
 def test_no_picture_of_an_earlier_measurement_stays(tmp_path):
-    pose = PrintPose(before_camera(0.9), (1, 2, 3), (), *[0.0] * 6, aspect=1.0)
+    pose = PrintPose(LaidPrint(before_camera(0.9)), (1, 2, 3), (), *[0.0] * 6, aspect=1.0)
     measurement = of_photograph("p.png", (0.4, 0.4), 12, pose, None, None)
     (tmp_path / "p.measured.png").touch()
     target = tmp_path / "p.measured.json"
@@ -361,7 +388,7 @@ def test_a_print_that_does_not_hang_upright_is_said_to_be_turned(roll_deg, tilt_
     T = before_camera(0.9, 35, tilt_deg) @ make_transform(rotation_x(np.radians(roll_deg)), np.zeros(3))
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     T_world_from_camera = planar_pose(1.0, 2.0, 0.7) @ make_transform(level, [0.1, 0.0, 0.2])
-    pose = PrintPose(T, (1, 2, 3), (), *[0.0] * 6, aspect=1.0)
+    pose = PrintPose(LaidPrint(T), (1, 2, 3), (), *[0.0] * 6, aspect=1.0)
     for known, where in ((None, "of the photograph"), ((WIDTH, 1.0, 0.0), "the horizontal: ")):
         found = of_photograph("p.png", (0.4, 0.4), 12, pose, known, T_world_from_camera)
         said = dict(found.lines).get("turned", "")
@@ -372,7 +399,7 @@ def test_a_print_that_does_not_hang_upright_is_said_to_be_turned(roll_deg, tilt_
 
 
 def test_what_cannot_be_right_or_is_not_known_is_said():
-    pose = PrintPose(before_camera(0.9), (1, 2, 3), (), *[0.0] * 6, aspect=1.0)
+    pose = PrintPose(LaidPrint(before_camera(0.9)), (1, 2, 3), (), *[0.0] * 6, aspect=1.0)
     for scale, doubtful in ((0.8, False), (1.2, False), (9.99, True), (3.28, True), (0.1, True)):
         found = of_photograph("p.png", (0.4, 0.4), 12, pose, (WIDTH, scale, 0.0), None)
         assert ("in m?" in dict(found.lines)["size"]) == doubtful

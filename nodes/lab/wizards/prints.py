@@ -30,6 +30,7 @@ from calibration.print_measurement import (
     of_drive,
     of_photograph,
 )
+from calibration.print_model import LaidPrint
 from calibration.print_pose import PrintPose, fit_print
 from calibration.schema import CalibrationError, CameraCalibration, Intrinsics, load_calibration
 from nodes.bags.parts import is_bag_file
@@ -197,7 +198,7 @@ def _measure_photograph(
         _camera_in_world(lens, known),
     )
     by_car = isinstance(lens, CameraCalibration)
-    return _with_colours(found, rgb, lens, pose.T_camera_from_face, record, sheet, pose.seen, by_car)
+    return _with_colours(found, rgb, lens, pose.laid, record, sheet, pose.seen, by_car)
 
 
 def _measure_drive(
@@ -224,7 +225,7 @@ def _measure_drive(
     found = of_drive(bag.name, record.picture_m, len(record.markers), placed, metres_per_px)
     frame = next(rgb for stamp, rgb in read_frames(bag) if stamp == stamps[best])
     seen = tuple(views[best].markers)
-    return _with_colours(found, frame, camera, poses_before[best], record, sheet, seen, True)
+    return _with_colours(found, frame, camera, LaidPrint(poses_before[best]), record, sheet, seen, True)
 
 
 def _clearest(
@@ -252,7 +253,7 @@ def _with_colours(
     found: PrintMeasurement,
     rgb: Rgb,
     lens: Intrinsics,
-    T_camera_from_face: Array,
+    laid: LaidPrint,
     record: PrintRecord,
     sheet: Printable,
     seen: tuple[int, ...],
@@ -260,7 +261,7 @@ def _with_colours(
 ) -> MeasuredPrint:
     corners = {number: record.markers[number] for number in seen}
     try:
-        colours = print_colours(rgb, lens, T_camera_from_face, sheet, corners)
+        colours = print_colours(rgb, lens, laid, sheet, corners)
     except DegenerateDataError as error:
         return MeasuredPrint(replace(found, colours_unknown=str(error)), None, by_car)
     return MeasuredPrint(replace(found, colours=colours.error), colours, by_car)
