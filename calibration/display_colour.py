@@ -33,6 +33,8 @@ _LEAST_RANGE = 0.15
 _HELD_OUT = 0.3
 # A larger error on them is refused.
 _MOST_RMSE = 0.03
+# A colour is wrong if it is farther off than this, and the others fit so many times better without it.
+_ONE_WRONG, _MUCH_BETTER = 0.04, 2.5
 # A larger change of repeated colours while measuring is refused.
 _MOST_DRIFT = 0.03
 
@@ -183,12 +185,35 @@ def fit_display(
     fitted = ~held_out
     model = _fit(shown[fitted], seen[fitted], angles[fitted], inks)
     fit = DisplayFit(model, shown, seen, angles, held_out, drift)
+    _refuse_one_wrong(fit, inks)
     if fit.rmse(True) > _MOST_RMSE:
         raise PoorFitError(
             f"expected held-out colours within {100 * _MOST_RMSE:.1f} %, got {100 * fit.rmse(True):.1f} %: are exposure and white balance locked, "
             "night light, dynamic contrast and local dimming off, and was every colour shown long enough?"
         )
     return fit
+
+
+def _refuse_one_wrong(fit: DisplayFit, inks: bool) -> None:
+    """Refuse a colour without which all others fit much better: a picture that was taken before the screen changed bends the model elsewhere too.
+
+    Raises:
+        PoorFitError: There is one.
+    """
+    errors = np.abs(fit.model.forward(fit.shown, fit.cos_angle) - fit.seen).max(axis=1)
+    worst = int(errors.argmax())
+    if errors[worst] < _ONE_WRONG:
+        return
+    others = np.arange(len(errors)) != worst
+    rows = others & ~fit.held_out
+    model = _fit(fit.shown[rows], fit.seen[rows], fit.cos_angle[rows], inks)
+    after = np.abs(model.forward(fit.shown, fit.cos_angle) - fit.seen).max(axis=1)
+    without, with_it = (float(np.sqrt(np.mean(each**2))) for each in (after[others], errors))
+    if _MUCH_BETTER * without < with_it:
+        raise PoorFitError(
+            f"expected a picture of every colour that was shown, got one of colour {worst}, counted from 0, that is {100 * after[worst]:.0f} % off where "
+            f"the others, which fit to {100 * without:.1f} %, put it: was it taken before the screen changed? Take it again"
+        )
 
 
 def _require_usable(shown: Array, seen: Array, angles: Array, least_free: float) -> float:

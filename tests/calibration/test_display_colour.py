@@ -134,3 +134,16 @@ def test_the_file_survives_a_round_trip_and_refuses_nonsense(fit, tmp_path):
     with pytest.raises(CalibrationError, match="expected curves, mixing, ambient"):
         load_calibration(DisplayCalibration, tmp_path / "broken.yaml")
     assert DisplayModel.ideal().forward([[0.25, 0.5, 0.75]]) == pytest.approx(np.array([[0.25, 0.5, 0.75]]))
+
+
+@pytest.mark.parametrize("number", [45, 60, 80])
+def test_one_picture_of_the_colour_before_is_named(number):
+    """The fit spread its error over others: the model was up to 13 of 255 off, and its inverse 26."""
+    seen = noisy(monitor(SHOWN), np.random.default_rng(5))
+    changed = np.abs(monitor(SHOWN[number]) - monitor(SHOWN[number - 1])).max()
+    assert changed > 0.05
+    seen[number] = seen[number - 1]
+    with pytest.raises(
+        PoorFitError, match=rf"got one of colour {number}, counted from 0, that is \d+ % off where the others"
+    ):
+        fit_display(SHOWN, seen)
