@@ -271,6 +271,7 @@ def _part(geometry: Any, path: Path, notes: list[str]) -> MeshPart:
     triangles = np.asarray(geometry.vertices, dtype=np.float64)[faces]
     visual, linear = geometry.visual, path.suffix.lower() in _GLTF
     uv, material = getattr(visual, "uv", None), getattr(visual, "material", None)
+    notes += _see_through(material, path, linear)
     if material is not None and (shades := geometry.vertex_attributes.get("color")) is not None:
         rgb = _shares(np.asarray(shades)[:, :3])
         if not _names_an_image(material):
@@ -321,6 +322,17 @@ def _factor(material: Any) -> Array:
     """The factor ``[3]`` of a glTF material on its colours, in linear light."""
     factor = getattr(material, "baseColorFactor", None)
     return np.ones(3) if factor is None else np.asarray(factor, np.float64)[:3] / 255.0
+
+
+def _see_through(material: Any, path: Path, linear: bool) -> list[str]:
+    """A note about a glTF material whose factor makes it transparent; its textures have notes of their own."""
+    factor = getattr(material, "baseColorFactor", None)
+    opaque = not linear or getattr(material, "alphaMode", None) in (None, "OPAQUE")
+    if opaque or factor is None or len(factor) < 4 or factor[3] >= _TRANSPARENT:
+        return []
+    return [
+        f"a material of {path.name} is opaque to {factor[3] / 255:.0%} only; objects are opaque, so it is shown opaque"
+    ]
 
 
 def _shares(colours: NDArray[Any]) -> Array:

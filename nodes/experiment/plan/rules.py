@@ -163,11 +163,13 @@ def check_own_scene(space: SpaceConfig, objects: Sequence[WantedObject], attack:
         isinstance(space, PlacesConfig) and meshes,
         f"expected objects made of voxels with space.kind places, got the mesh {', '.join(meshes)}; 'advnerf scene object build' makes voxels of it",
     )
-    unbuilt = [each.name for each in things if each.name not in (*voxels, *meshes)]
+    unbuilt = [
+        f"{each.name} ({name_of(each.kind)})" for each in things if each.name not in (*voxels, *meshes)
+    ]
     _refuse(
         unbuilt and not of_meshes,
         f"expected panels, cubes, files of 'advnerf scene object build' (*{OBJECT_SUFFIX}) or objects with the section mesh in a learned scene of your "
-        f"own, got {', '.join(unbuilt)}",
+        f"own, got {', '.join(unbuilt)}; add mesh: {{}} to it",
     )
     shown = [each.name for each in things if each.face is not None and each.face.display is not None]
     _refuse(

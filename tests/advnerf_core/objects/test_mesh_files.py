@@ -362,6 +362,15 @@ def test_voxels_that_lose_the_object_are_refused_or_told():
     assert fine["held_out_object_psnr_db"] < fine["held_out_psnr_db"] - 5.0
 
 
+@pytest.mark.parametrize(
+    ("mode", "alpha", "noted"), [("BLEND", 0.3, True), ("OPAQUE", 0.3, False), ("BLEND", 1.0, False)]
+)
+def test_a_material_that_is_transparent_is_noted(tmp_path, mode, alpha, noted):
+    material = {"alphaMode": mode, **pbr(baseColorFactor=[0.5, 0.5, 0.5, alpha])}
+    notes = load_mesh(gltf(tmp_path / "a.gltf", material)).notes
+    assert any("a material of a.gltf is opaque to 30% only" in note for note in notes) == noted
+
+
 def test_a_sheet_that_no_voxels_hold_is_made_a_voxel_thick(tmp_path):
     """A sign of other software is often two triangles."""
     corners = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 1, 0], [-1, 1, 0]])
