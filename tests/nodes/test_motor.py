@@ -88,7 +88,7 @@ def test_motor_connects_stops_and_waits_for_the_safety_node(drives):
     drives.send(0.0, 0.0)
     state, text = drives.node.status()
     assert state == "ready"
-    assert text == "TWIN firmware 5.02, own time-out 1000 ms with 0 A"
+    assert text == "TWIN firmware 5.02, own time-out 250 ms with 20 A"
 
 
 def test_motor_obeys_and_reports_the_origin(drives):

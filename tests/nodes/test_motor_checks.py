@@ -322,7 +322,7 @@ def test_a_repeated_request_for_the_check_is_obeyed_once_and_answered_every_time
 
 
 def test_command_line(tmp_path):
-    with VescEmulator(VescEmulatorConfig(**TIMEOUT), TwinVehicle(CarConfig()), tmp_path / "vesc") as emulator:
+    with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "vesc") as emulator:
         port = ["--vesc", str(tmp_path / "vesc")]
         shown = CliRunner().invoke(app, ["car", "motor", "info", *port])
         assert shown.exit_code == 0, shown.output

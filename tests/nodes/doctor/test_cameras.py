@@ -2,6 +2,7 @@
 
 import threading
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -61,11 +62,13 @@ PORTS = {}
 @contextmanager
 def exposing(device, value=128, rate_hz=30.0):
     stop = threading.Event()
-    data = bytes([value, 128]) * (device.width * device.height)
+    pixels = device.width * device.height
 
     def expose():
-        while not stop.wait(1.0 / rate_hz):
-            device.expose(data)
+        for number in count():
+            if stop.wait(1.0 / rate_hz):
+                break
+            device.expose(bytes([value + number % 2, 128]) * pixels)  # no two pictures of a sensor are alike
 
     thread = threading.Thread(target=expose)
     thread.start()
