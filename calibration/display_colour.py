@@ -33,7 +33,7 @@ _LEAST_RANGE = 0.15
 _HELD_OUT = 0.3
 # A larger error on them is refused.
 _MOST_RMSE = 0.03
-# A colour is wrong if it is farther off than this, and the others fit so many times better without it.
+# A colour is wrong if it is farther off than this, and the others fit better by this factor without it.
 _ONE_WRONG, _MUCH_BETTER = 0.04, 2.5
 # A larger change of repeated colours while measuring is refused.
 _MOST_DRIFT = 0.03
@@ -195,10 +195,10 @@ def fit_display(
 
 
 def _refuse_one_wrong(fit: DisplayFit, inks: bool) -> None:
-    """Refuse a colour without which all others fit much better: a picture that was taken before the screen changed bends the model elsewhere too.
+    """Refuse a colour without which all others fit much better: a picture that was taken before the screen changed bends the model for other colours too.
 
     Raises:
-        PoorFitError: There is one.
+        PoorFitError: A colour is wrong.
     """
     errors = np.abs(fit.model.forward(fit.shown, fit.cos_angle) - fit.seen).max(axis=1)
     worst = int(errors.argmax())

@@ -97,7 +97,7 @@ def light_on(rgb: Rgb, lens: Intrinsics, laid: LaidPrint, corners_m: Mapping[int
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        laid: How the print lies before the camera.
+        laid: The print as it lies before the camera.
         corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
 
     Raises:
@@ -201,7 +201,7 @@ def patch_colours(
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        laid: How the chart lies before the camera.
+        laid: The chart as it lies before the camera.
         picture_m: Width and height of all patches [m].
         corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
 
@@ -270,7 +270,7 @@ def print_colours(
 
     Args:
         rgb: The photograph ``[H, W, 3]``.
-        laid: How the print lies before the camera.
+        laid: The print as it lies before the camera.
         corners_m: Nominal corners ``[4, 3]`` of each seen marker by number [m].
 
     Raises:

@@ -94,7 +94,7 @@ class LaidPrint:
     Attributes:
         T_camera_from_face: Pose ``[4, 4]`` of the print's middle plane, in nominal units.
         log_aspect: Logarithm of its aspect over the nominal one.
-        bend: As of `bend_m`.
+        bend: Parameters ``[3]`` of `bend_m`.
         half_m: `half_side` of its markers.
     """
 

@@ -110,7 +110,7 @@ class FrameDecoder:
 
     @property
     def left_over(self) -> int:
-        """Number of bytes so far outside of whole frames."""
+        """Number of received bytes outside of whole frames."""
         return self.skipped_bytes + len(self._buffer)
 
     def _search(self, patient: bool) -> list[bytes]:

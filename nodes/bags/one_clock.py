@@ -15,7 +15,7 @@ from nodes.runtime.errors import BagError
 
 # Delays from stamp to recording differ by less between topics of one clock, also over Wi-Fi.
 _MOST_APART_S = 0.5
-# Delays are compared in stretches of so long, in each from at least so many messages: a clock may drift, or be set in the middle.
+# Delays are compared in stretches of this length, in each from at least this many messages: a clock may drift, or be set in the middle.
 _STRETCH_S, _ENOUGH = 5.0, 3
 # A stretch in which the recorder's clock was set proves nothing.
 _STRETCHES = 2

@@ -20,7 +20,7 @@ def wait_or_kill(process: subprocess.Popen[Any], wait_s: float) -> None:
 
 
 def ending_signals() -> tuple[signal.Signals, ...]:
-    """SIGTERM, and what a closed terminal, a lost ssh connection and Ctrl-\\ send; without those that this process was told to ignore (nohup)."""
+    """SIGTERM, and what a closed terminal, a lost ssh connection and Ctrl-\\ send; without the signals that this process must ignore (nohup)."""
     others = (signal.SIGHUP, signal.SIGQUIT)
     return (signal.SIGTERM, *(each for each in others if signal.getsignal(each) is not signal.SIG_IGN))
 
