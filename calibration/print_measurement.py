@@ -40,6 +40,7 @@ class PrintMeasurement(PlainData):
         markers_seen: Numbers of the markers that were used.
         markers_dropped: Numbers of those that do not lie where the others put them.
         markers_printed: Number of markers on the print.
+        markers_outside: Number of markers that lie outside a photograph.
         residual_px: Root mean square distance of the corners from where a flat print has them [px].
         residual_mm: The same in the print's plane [mm].
         flatness_mm: Root mean square distance of the markers from their plane [mm]; of a photograph, as far as it shows a bend.
@@ -64,6 +65,7 @@ class PrintMeasurement(PlainData):
     residual_mm: float
     flatness_mm: float
     flatness_sd_mm: float
+    markers_outside: int = 0
     colours: ColourError | None = None
     colours_unknown: str = ""
 
@@ -120,7 +122,11 @@ class PrintMeasurement(PlainData):
         text = f"{len(self.markers_seen)} of {self.markers_printed}"
         if self.markers_dropped:
             text += f"; left out, as they do not fit: {', '.join(map(str, self.markers_dropped))}"
-        missing = self.markers_printed - len(self.markers_seen) - len(self.markers_dropped)
+        if self.markers_outside:
+            text += f"; {self.markers_outside} outside the picture"
+        missing = (
+            self.markers_printed - len(self.markers_seen) - len(self.markers_dropped) - self.markers_outside
+        )
         return f"{text}; {missing} not found, so the print may be covered there" if missing else text
 
     def _size(self) -> str:
@@ -158,7 +164,7 @@ class PrintMeasurement(PlainData):
         text = f"{found.rms:.0f} of 255 from nominal (mean {red:+.0f}, {green:+.0f}, {blue:+.0f}), light uneven by {100 * found.uneven:.0f} %"
         if found.far_share > 0.02:
             why = (
-                "covered?"
+                "covered, or colours that the printer has not?"
                 if found.far_share < _OTHER_SHARE
                 else "another texture in this frame, or the wrong --print or --attack?"
             )

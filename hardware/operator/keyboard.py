@@ -1,6 +1,8 @@
 """Keyboard input from a terminal. Terminals send no key-up events, so a key counts as held while it repeats.
 
-So a tap never moves the car: holding begins with the second repeat in a row and ends when the next one is late. The hand drives
+So a tap never moves the car: holding begins with the second repeat in a row and ends when the next one is late. A key that only seemed
+to be let go, as the terminal or ssh was held up, repeats at once; one that is pressed again waits for a quarter of a second and more
+after its first letter, and only this counts as holding again. The hand drives
 with w (straight), a and d (left, right) and s (backwards); o lets the software drive; space is the e-stop, r re-arms.
 """
 
@@ -40,6 +42,7 @@ class Keyboard:
         self._before: list[Any] | None = termios.tcgetattr(fd)
         tty.setcbreak(fd, termios.TCSANOW)
         self._key, self._repeats, self._key_ns = "", 0, 0
+        self._lapsed = False
         self._stops = self._rearms = 0
         self._lost = False
         self._rest = ""
@@ -50,7 +53,7 @@ class Keyboard:
             if select.select([self._fd], [], [], timeout_s)[0] and not self._lost:
                 self._take()
         now_ns = self._mono_ns()
-        held = self._key if self._repeats >= 2 and now_ns - self._key_ns <= _LATE_NS else ""
+        held = self._key if self._is_held and now_ns - self._key_ns <= _LATE_NS else ""
         throttle, steering = _DRIVE.get(held, (0.0, 0.0))
         return Hands(
             held in _DRIVE,
@@ -70,6 +73,10 @@ class Keyboard:
                 termios.tcsetattr(self._fd, termios.TCSANOW, self._before)
         self._before = None
 
+    @property
+    def _is_held(self) -> bool:
+        return self._repeats >= 2 and not self._lapsed
+
     def _take(self) -> None:
         try:
             got = os.read(self._fd, 256).decode("ascii", "replace")
@@ -87,5 +94,9 @@ class Keyboard:
         self._rearms += keys.count(_REARM)
         # A burst after a pause shows pressed keys, not a held one: it counts as one.
         key = keys[-1:]
-        again = bool(key) and key == self._key and now_ns - self._key_ns <= _LATE_NS
+        late = now_ns - self._key_ns > _LATE_NS
+        if late:
+            # A second pause, after one letter alone: the key was pressed again.
+            self._lapsed = self._is_held or (self._lapsed and self._repeats > 0)
+        again = bool(key) and key == self._key and not late
         self._key, self._repeats, self._key_ns = key, self._repeats + 1 if again else 0, now_ns

@@ -170,6 +170,24 @@ def test_a_tap_never_drives_and_holding_does(terminal):
     assert not terminal.wait(60).human
 
 
+@pytest.mark.parametrize("burst", ["w", "wwwwwwww"])
+def test_a_key_that_is_still_held_after_a_pause_of_the_terminal_must_be_let_go(terminal, burst):
+    """As of a process that was stopped, or of ssh: the car would move again although nobody has pressed anything."""
+    for _ in range(4):
+        held = terminal.type("w")
+    assert held.human
+    assert not terminal.type(burst, 1500).human
+    for _ in range(30):
+        assert not terminal.type("w").human
+    assert not terminal.type("w", 800).human  # the next pause changes nothing
+    for _ in range(10):
+        assert not terminal.type("w").human
+    assert not terminal.type("w", 400).human  # let go and pressed again,
+    assert not terminal.type("w", 250).human  # which repeats after the terminal's delay
+    terminal.type("w")
+    assert terminal.type("w").human
+
+
 def test_another_key_must_be_held_itself(terminal):
     for _ in range(4):
         held = terminal.type("o")

@@ -112,6 +112,24 @@ def test_a_photograph_gives_pose_and_colours_and_with_one_length_the_size(call, 
     assert json.loads((folder / "photo.measured.json").read_text())["size_m"] == pytest.approx((0.412, 0.412))
 
 
+def test_markers_outside_the_picture_are_not_called_covered(call, folder):
+    assert (
+        call("attack", "print", folder / "a.attack.safetensors", "-o", folder / "p.png", "--dpi", 50)[0] == 0
+    )
+    picture = photograph(
+        [(scaled(poster(folder), 1.0, 1.0, 75.0), before_camera(0.6, 10, 3, 2, 0.19))],
+        LENS,
+        light=(0.8, 0.8, 0.8),
+    )
+    write_image(folder / "photo.jpg", picture)
+    code, said = call(*measure_command(folder, "photo.jpg"))
+    assert code == 0
+    found = json.loads((folder / "photo.measured.json").read_text())
+    assert found["markers_outside"] == 12 - len(found["markers_seen"]) > 0
+    assert f"{found['markers_outside']} outside the picture" in said
+    assert "may be covered" not in said
+
+
 @pytest.mark.parametrize("cells", [8, 64])
 @pytest.mark.parametrize(
     ("camera", "away_m"),
@@ -404,7 +422,7 @@ def test_what_cannot_be_right_or_is_not_known_is_said():
         found = of_photograph("p.png", (0.4, 0.4), 12, pose, (WIDTH, scale, 0.0), None)
         assert ("in m?" in dict(found.lines)["size"]) == doubtful
         assert "--car X,Y,YAW" in dict(found.lines)["in the world"]
-    for share, words in ((0.2, "covered?"), (0.99, "wrong --print")):
+    for share, words in ((0.2, "covered, or colours that the printer has not?"), (0.99, "wrong --print")):
         colours = ColourError(rms=30.0, mean=(0.0, 0.0, 0.0), uneven=0.0, far_share=share, seen_share=1.0)
         assert words in dict(replace(found, colours=colours).lines)["colours"]
 

@@ -197,6 +197,12 @@ def _measure_photograph(
         known.scale_of(pose, record.picture_m),
         _camera_in_world(lens, known),
     )
+    outside = [
+        number
+        for number, corners in record.markers.items()
+        if number not in markers and not in_picture(pose.laid.in_camera(corners), lens)
+    ]
+    found = replace(found, markers_outside=len(outside))
     by_car = isinstance(lens, CameraCalibration)
     return _with_colours(found, rgb, lens, pose.laid, record, sheet, pose.seen, by_car)
 
