@@ -17,12 +17,14 @@ from rich.text import Text
 from typer.testing import CliRunner
 
 from advnerf_core.files import write_atomically
+from advnerf_core.geometry import make_transform
 from hardware.emulators.vesc_emulator import VescEmulator
 from hardware.emulators.vesc_firmware import VescEmulatorConfig
 from hardware.emulators.vicon_emulator import ViconEmulator, ViconEmulatorConfig
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.cli.main import app
+from nodes.lab.doctor import motor
 
 ROOT = Path(__file__).resolve().parents[1]
 _COLUMNS = 96
@@ -31,12 +33,17 @@ _ROWS = ("VESC", "VESC time-out", "battery", "VICON", "camera")
 
 def output() -> list[str]:
     """The lines of the command about devices, with their colours."""
-    subjects = {"car": np.eye(4), "board": np.eye(4)}
+    subjects = {
+        "car": make_transform(np.eye(3), [1.2, -0.4, 0.02]),
+        "board": make_transform(np.eye(3), [3.1, -1.8, 0.5]),
+    }
     vicon = ViconEmulator(ViconEmulatorConfig(port=51001), lambda mono_ns: subjects)
     try:
         with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as vesc:
-            done = CliRunner().invoke(app, ["doctor", "--vesc", vesc.port], color=True)
-            # The number of a pseudo-terminal stands where a car has its udev name.
+            motor.FIXED_NAME = Path(
+                vesc.port
+            )  # the number of a pseudo-terminal, where a car has its udev name
+            done = CliRunner().invoke(app, ["doctor"], color=True)
             lines = done.output.replace(vesc.port, "/dev/vesc").splitlines()
     finally:
         vicon.close()

@@ -7,6 +7,9 @@ import socket
 import time
 from collections.abc import Sequence
 
+import numpy as np
+
+from advnerf_core.geometry import Array
 from hardware.errors import DeviceBusy, ProtocolError
 from hardware.mocap.vicon import DEFAULT_PORT, ViconConfig, ViconReceiver
 from hardware.mocap.vicon_codec import decode_block
@@ -14,6 +17,7 @@ from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, CheckResult, re
 
 LISTEN_S = 1.5
 _NAME = "VICON"
+_NEAR_ORIGIN_M = 0.02
 _CURE = "in Tracker, enable System > UDP Object Stream to this computer's address; firewall: sudo ufw allow {port}/udp"
 
 
@@ -47,11 +51,11 @@ def listen(
         if not config.subjects:
             config = ViconConfig(_names(config, listen_s / 3), config.host, config.port, source=config.source)
         with ViconReceiver(config) as receiver:
-            seen = dict.fromkeys(config.subjects, 0)
+            seen: dict[str, list[Array]] = {name: [] for name in config.subjects}
             deadline = time.monotonic() + listen_s
             while (left_s := deadline - time.monotonic()) > 0.0:
                 for pose in receiver.read(left_s):
-                    seen[pose.name] += 1
+                    seen[pose.name].append(pose.T_world_from_subject[:3, 3])
             counts = receiver.counts
     except DeviceBusy:
         return free_port(config.port, config.host)
@@ -67,14 +71,19 @@ def listen(
             _NAME, WARNING, f"{counts.refused} of {counts.datagrams} datagrams are not Tracker's", do
         )
     return rows + [
-        _subject(name, number / listen_s, required and name in (needed or config.subjects))
-        for name, number in seen.items()
+        _subject(name, places, listen_s, required and name in (needed or config.subjects))
+        for name, places in seen.items()
     ]
 
 
-def _subject(name: str, rate_hz: float, required: bool) -> CheckResult:
-    if rate_hz:
-        return CheckResult(_NAME, OK, f"{name}: {rate_hz:.0f} poses a second")
+def _subject(name: str, places_m: Sequence[Array], listen_s: float, required: bool) -> CheckResult:
+    if places_m:
+        x_m, y_m, z_m = np.round(places_m[-1], 3) + 0.0  # without a minus before a zero
+        text = f"{name}: {len(places_m) / listen_s:.0f} poses a second, at x {x_m:.3f}, y {y_m:.3f}, z {z_m:.3f} m"
+        if max(abs(x_m), abs(y_m), abs(z_m)) < _NEAR_ORIGIN_M:
+            do = "measure where it stands: a stream in metres, where Tracker sends mm, puts everything there, and inside every fence"
+            return CheckResult(_NAME, WARNING, text, do)
+        return CheckResult(_NAME, OK, text)
     do = "check the subject's name, tick mark and markers in Tracker"
     return CheckResult(_NAME, FAILURE if required else WARNING, f"{name} is not seen", do)
 

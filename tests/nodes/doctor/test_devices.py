@@ -3,6 +3,7 @@
 import contextlib
 import os
 import pty
+import re
 import socket
 import threading
 import time
@@ -59,10 +60,13 @@ def test_battery_fault_and_a_firmware_that_does_not_tell():
     assert "VESC Tool" in vesc({**GOOD, "readable_settings": False})["VESC time-out", WARNING].do
 
 
-@pytest.mark.parametrize("wire", ["silent", "garbage"])
-def test_a_line_without_a_sensible_word(wire):
+@pytest.mark.parametrize(
+    ("wire", "got"),
+    [("silent", "got nothing; is this a VESC"), ("garbage", r"got \d+ bytes that are no frames of a VESC")],
+)
+def test_a_line_without_a_sensible_word(wire, got):
     row = vesc(wire=wire)["VESC", FAILURE]
-    assert "got nothing" in row.found
+    assert re.search(got, row.found), row.found
     assert "check the port" in row.do
 
 
@@ -168,6 +172,20 @@ def test_the_stream_its_rate_and_its_subjects():
         assert listen(emulator.config.port, ("car", "wand"), needed=("car",))[-1].state == WARNING
         unasked = listen(emulator.config.port, ())
         assert {row.found.split(":")[0] for row in unasked[1:]} == {"car", "board"}
+
+
+def test_places_are_told_and_a_stream_in_metres_is_suspected():
+    """Tracker sends mm. In metres, everything stands within millimetres of the origin, and inside every fence."""
+    with tracker() as emulator:
+        car = listen(emulator.config.port)[1]
+        assert (car.state, car.found.endswith("at x 1.000, y 0.000, z 0.000 m")) == (OK, True)
+    small = {"car": np.eye(4) + 0.001 * np.eye(4, k=3)}
+    emulator = FaultyViconEmulator(ViconEmulatorConfig(port=free_udp_port()), lambda ns: small)
+    try:
+        car = listen(emulator.config.port, ("car",))[1]
+        assert (car.state, "a stream in metres" in car.do) == (WARNING, True)
+    finally:
+        emulator.close()
 
 
 @pytest.mark.parametrize("form", ["missing", "zeros", "nan", "frozen"])
