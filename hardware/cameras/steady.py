@@ -98,8 +98,8 @@ class SteadyCamera:
         if self._same >= self._repeats:
             self._stalls += 1
             raise HardwareError(
-                f"the camera repeats one image ({self._same + 1} identical frames); reopening it. If the scene is dark, or a"
-                " recording, disable this check with repeats: 0"
+                f"the camera repeats one image ({self._same + 1} identical frames); reopening it. If the scene is dark, simulated or"
+                " recorded, disable this check with repeats: 0"
             )
 
     def _give_up(self, error: str) -> None:

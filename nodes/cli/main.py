@@ -166,7 +166,7 @@ def _watch_launch(started: Launch, duration_s: float | None) -> None:
 
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal asked
-        asked += 1
+        asked += number != signal.SIGHUP  # a closed terminal sends it twice, itself and through the shell
         started.request_stop(kill=asked > 1)
 
     for number in (signal.SIGINT, *ending_signals()):

@@ -1,3 +1,4 @@
+import contextlib
 import errno
 import fcntl
 import os
@@ -29,6 +30,7 @@ from nodes.runtime.termination import ending_signals
 from tests.support.waiting import wait_for
 
 SENDER = """
+    import time
     import numpy as np
     from pydantic import BaseModel, ConfigDict
     from nodes.runtime.messages import pose_message
@@ -50,6 +52,9 @@ SENDER = """
             return []
         def tick(self, now):
             return [Out("/vicon/car", pose_message(np.eye(4), now.real_ns))]
+        def close(self):
+            time.sleep(0.5)  # as a car that is braked to a standstill
+            print("closed", flush=True)
 
     raise SystemExit(run_node_main(Config, lambda config, context: Sender(config)))
 """
@@ -123,7 +128,12 @@ def test_a_launch_whose_terminal_is_closed_ends_in_order(folder):
     while b"all nodes are ready" not in said:
         said += os.read(master, 4096)
     os.close(master)
+    for _ in range(3):  # the shell of the terminal sends it too
+        time.sleep(0.05)
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(signal.SIGHUP)
     assert process.wait(timeout=600) == 0
+    assert "closed" in (folder / "closed" / "logs" / "sender.log").read_text()
 
 
 def test_what_a_program_was_told_to_ignore_does_not_end_it(monkeypatch):
