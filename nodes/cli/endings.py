@@ -13,7 +13,7 @@ from typing import Any
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import PART, not_writable
 
-INTERRUPTED, TERMINATED = 130, 143
+INTERRUPTED = 130
 # Commands that continue where they were stopped when they are given again. ``scene from-...`` say so themselves, with the folder.
 _RESUMABLE = (
     ("demo",),

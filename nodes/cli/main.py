@@ -33,7 +33,6 @@ from nodes.cli import scene as cli_scene
 from nodes.cli import verify as cli_verify
 from nodes.cli.endings import (
     INTERRUPTED,
-    TERMINATED,
     how_to_resume,
     is_resumable,
     text_for_people,
@@ -225,9 +224,15 @@ def main() -> None:
     resumable = is_resumable(words)
     with ends_in_order() if resumable else contextlib.nullcontext():
         code = _exit_code()
-    if resumable and code in (INTERRUPTED, TERMINATED):
+    if resumable and code and _is_signal(code):
         say_error(how_to_resume(words))
     raise SystemExit(code)
+
+
+def _is_signal(code: object) -> bool:
+    from advnerf_core.plugins import is_signal  # for what ends early, too much to load at each start
+
+    return is_signal(code)
 
 
 def _exit_code() -> int:
@@ -258,9 +263,9 @@ def _code_of_exit(code: str | int | None) -> int:
     """Exit code of what ended by ``sys.exit``: a signal, the shell's completion before a command, or a user's code inside one."""
     if not _is_in_command:
         return code if isinstance(code, int) else FAILURE_EXIT if code else 0
-    from advnerf_core.plugins import EXITED, is_signal
+    from advnerf_core.plugins import EXITED
 
-    if isinstance(code, int) and is_signal(code):
+    if isinstance(code, int) and _is_signal(code):
         return code
 
     say_error(f"{EXITED}({code or ''})")

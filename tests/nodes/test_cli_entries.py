@@ -212,12 +212,13 @@ def test_a_shell_completes_groups_and_commands() -> None:
         assert ended.stdout.split() == [expected], ended.stderr
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_command_that_was_stopped_names_the_one_that_continues(tmp_path: Path, number: int) -> None:
     code = (
         "import os, signal, sys, time; from nodes.cli import main\n"
         # Where the tests run in the background of a shell, SIGINT is ignored by what they start.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "for each in (signal.SIGHUP, signal.SIGQUIT): signal.signal(each, signal.SIG_DFL)\n"
         f"def stopped(**_):\n    os.kill(os.getpid(), {int(number)})\n    time.sleep(60)\n"
         "main.app = stopped; sys.argv = ['advnerf', 'scene', 'train', 'my pictures', '-o', 'out']; main.main()"
     )

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn, TextIO
 
 from advnerf_core.files import write_atomically
-from advnerf_core.plugins import exit_refused, in_one_line
+from advnerf_core.plugins import exit_refused, in_one_line, is_signal
 from advnerf_core.run_module import module_command
 from nodes.experiment.engine.artefact import digests_in
 from nodes.experiment.plan.cell import Cell
@@ -37,7 +37,7 @@ from nodes.runtime.progress import Report
 from nodes.runtime.termination import ends_in_order, wait_or_kill
 
 Phase = Literal["search", "whole"]
-_DONE, _FAILED, _ELSEWHERE, _CHANGED, _ASKED_TO_END = 0, 1, 3, 4, 128 + signal.SIGTERM
+_DONE, _FAILED, _ELSEWHERE, _CHANGED = 0, 1, 3, 4
 _PROGRESS_PERIOD_S = 5.0
 _LOOKED_AT_S = 1.0
 # Longer than CarlaScene waits for a server that is gone.
@@ -140,8 +140,8 @@ def run_in_process(job: Job) -> Ended:
     if code == _CHANGED:
         return Ended(job.name, "lost", said, seconds)
     # A process that was asked to end closed its resources, and reports it by the shell's exit code.
-    if code < 0 or code == _ASKED_TO_END:
-        by = signal.Signals(-code) if code < 0 else signal.SIGTERM
+    if code < 0 or is_signal(code):
+        by = signal.Signals(-code if code < 0 else code - 128)
         return Ended(
             job.name, "lost", f"killed by {by.name}; it goes on when the experiment is run again", seconds
         )

@@ -226,15 +226,16 @@ def is_alive(pid):
     return False
 
 
-def test_a_worker_that_is_asked_to_end_has_not_failed(here):
-    """As by a daemon that frees memory: it goes on when the experiment is run again, without being asked to try again."""
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_worker_that_is_asked_to_end_has_not_failed(here, number):
+    """As by a daemon that frees memory, or a closed terminal: it goes on when the experiment is run again, without being asked to try again."""
     here.write(seed=[0], method=["gradient"])
     process, worker = start_hanging(here)
-    os.kill(worker, signal.SIGTERM)
+    os.kill(worker, number)
     out, err = process.communicate(timeout=600)
     assert process.returncode == 1
     assert "straight_hardened_gradient_0: lost" in out
-    assert "killed by SIGTERM" in err
+    assert f"killed by {number.name}" in err
     assert states(here) == {"straight_hardened_gradient_0": "begun"}
 
 
