@@ -78,10 +78,8 @@ def corner_errors(markers: Mapping[int, Array], corners_m: Mapping[int, Array], 
     middles, half_m = points.mean(axis=1, keepdims=True), half_side(corners_m)
 
     def errors(p: Array) -> Array:
-        laid = (middles + (1.0 + p[GROWTH]) * (points - middles)) * np.exp(
-            [0.0, 0.5 * p[ASPECT], -0.5 * p[ASPECT]]
-        )
-        laid[..., 0] = bend_m(p[BEND], points / half_m)
+        grown = middles + (1.0 + p[GROWTH]) * (points - middles)
+        laid = _laid_out(grown, p[ASPECT], bend_m(p[BEND], points / half_m))
         return pinhole.project(moved(p, laid)) - pixels
 
     return errors
@@ -105,9 +103,15 @@ class LaidPrint:
 
     def in_camera(self, points_m: Array) -> Array:
         """Points of the print ``[..., 3]``, nominal, in the camera's frame."""
-        laid = points_m * np.exp([0.0, 0.5 * self.log_aspect, -0.5 * self.log_aspect])
-        laid[..., 0] += bend_m(self.bend, points_m / self.half_m)
+        laid = _laid_out(points_m, self.log_aspect, bend_m(self.bend, points_m / self.half_m))
         return transform_points(self.T_camera_from_face, laid.reshape(-1, 3)).reshape(points_m.shape)
+
+
+def _laid_out(points_m: Array, log_aspect: float, bent_m: Array) -> Array:
+    """Points ``[..., 3]`` of a flat print, stretched by its aspect and moved off its plane by ``[...]`` [m]."""
+    laid = points_m * np.exp([0.0, 0.5 * log_aspect, -0.5 * log_aspect])
+    laid[..., 0] = bent_m
+    return laid
 
 
 def half_side(corners_m: Mapping[int, Array]) -> float:

@@ -53,6 +53,7 @@ class PrintPose:
     """A print in a photograph. Lengths are in units of the nominal size: times the print's true scale, they are metres.
 
     Attributes:
+        laid: Where its points are, with its aspect and bend.
         seen: Numbers of the markers that were used.
         dropped: Numbers of those that were found, and left out, because they do not lie where the others put them.
         rms_px: Root mean square distance of the corners from their projections [px].
@@ -61,10 +62,8 @@ class PrintPose:
         bend_sd_m: Standard deviation of the bend.
         angle_sd_rad: Standard deviation of the direction that the print faces [rad].
         distance_sd: Standard deviation of the distance, as a share of it.
-        aspect: Width over height, as a share of the nominal ratio; 1 where the photograph does not tell it from 1.
         card_scale: True size over nominal size, by the card; None without a card.
         card_scale_sd: Standard deviation of the card's scale.
-        laid: Where its points are, with its aspect and bend.
     """
 
     laid: LaidPrint
@@ -76,7 +75,6 @@ class PrintPose:
     bend_sd_m: float
     angle_sd_rad: float
     distance_sd: float
-    aspect: float
     card_scale: float | None = None
     card_scale_sd: float = 0.0
 
@@ -84,6 +82,11 @@ class PrintPose:
     def T_camera_from_face(self) -> Array:
         """Pose ``[4, 4]`` of the middle plane."""
         return self.laid.T_camera_from_face
+
+    @property
+    def aspect(self) -> float:
+        """Width over height, as a share of the nominal ratio; 1 where the photograph does not tell it from 1."""
+        return float(np.exp(self.laid.log_aspect))
 
     @property
     def view_angle_rad(self) -> float:
@@ -130,7 +133,6 @@ def fit_print(
         _require_flat(fit, extent_px, kept, corners_m)
     distance_sd = _require_sure(fit, scale_sd, len(kept))
     rms_m = fit.rms_px * float(np.linalg.norm(fit.values[3:6])) / pinhole.fx
-    aspect = float(np.exp(fit.values[ASPECT]))
     return PrintPose(
         LaidPrint(fit.transform, float(fit.values[ASPECT]), fit.values[BEND], half_side(corners_m)),
         tuple(kept),
@@ -141,7 +143,6 @@ def fit_print(
         bend_sd,
         fit.angle_sd_rad,
         distance_sd,
-        aspect,
         scale,
         scale_sd,
     )

@@ -45,7 +45,7 @@ _MISTAKES: dict[str, Callable[[Array], Array]] = {
 def require_agreeing_poses(frames: Sequence[PosedImage], name: str) -> None:
     """Refuse poses that do not fit their photographs, if the same poses fit once a usual mistake is undone.
 
-    Photographs without enough features in common, as of white walls, say nothing and pass. At most a hundred are read.
+    Photographs without enough features in common, as of white walls, say nothing and pass. At most sixty are read.
 
     Args:
         frames: Photographs in an order in which most have something in common with the next one.

@@ -87,9 +87,8 @@ def repair(file: Path, force: bool = False, keep_original: bool = True, in_place
     """
     path = file.resolve()
     if (form := recognise(path)) is not BagFormat.MCAP:
-        read_stored(
-            path, form, path.stat().st_size
-        )  # a damaged one says what rebuilds it, as it cannot be converted
+        # A damaged one says what rebuilds it, as it cannot be converted.
+        read_stored(path, form, path.stat().st_size)
     require_mcap(path, "repaired")
     try:
         before = path.stat()

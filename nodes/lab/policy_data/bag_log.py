@@ -121,7 +121,7 @@ def read_bag_log(bag: Path, choice: LogChoice) -> DriveLog:
     kinds = {images: IMAGE_TYPE, **({steering: _steering_type(steering)} if steering else {})}
     others = [name for name in cameras if name != images]
     with _naming(others):
-        first_ns = _first_times(bag, kinds)
+        first_ns = _first_stamps(bag, kinds)
     unstamped = [topic for topic, times in first_ns.items() if len(times) > 1 and len(set(times)) == 1]
     if not unstamped:
         try:
@@ -207,7 +207,7 @@ def _steering_type(topic: str) -> str:
     return topic_row(topic).type if topic == _SENT else _ACKERMANN
 
 
-def _first_times(bag: Path, kinds: Mapping[str, str]) -> dict[str, list[int]]:
+def _first_stamps(bag: Path, kinds: Mapping[str, str]) -> dict[str, list[int]]:
     """Stamps [ns] of the first messages of topics. If all are equal, as of a node that leaves them at zero, they join nothing.
 
     Args:
