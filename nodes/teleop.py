@@ -38,6 +38,7 @@ from nodes.runtime.node import (
 from nodes.runtime.process import run_node_main
 
 _STALE_S = 0.15
+_REFUSED_S = 0.3  # the safety node arms within a few milliseconds of a press
 
 
 class TeleopConfig(StrictModel):
@@ -78,7 +79,8 @@ class TeleopNode(Node):
         self._estop = False
         self._arm_in_ticks = 0
         self._asker, self._late = ArmAsker(), ""
-        self._mode = "idle"
+        self._mode, self._held_ns = "idle", 0
+        self._unarmed = self._told_unarmed = ""
         self._reader = ReaderThread(read, self.inbox, "hands")
         self._reader.start()
 
@@ -94,11 +96,12 @@ class TeleopNode(Node):
         return cls(config, device.read, device.close)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Check whether the safety node has answered a request, and whether the car brakes."""
+        """Check whether the safety node has answered a request, why the car is not armed, and whether it brakes."""
         if topic == "/motor/sent":
             self._asker.heard_motor(message, info)
         else:
             self._asker.heard(message, info)
+            self._unarmed = "" if message.armed else message.reason
         return []
 
     def receive(self, item: Hands, now: Now) -> list[Out]:
@@ -120,6 +123,7 @@ class TeleopNode(Node):
         A request is repeated until the safety node has answered. A request to re-arm also ends when it is too old.
         """
         self._say_late(now)
+        self._say_unarmed(now)
         if self._arm_in_ticks:
             self._arm_in_ticks -= 1
             if not self._arm_in_ticks:
@@ -146,6 +150,16 @@ class TeleopNode(Node):
         before, self._late = self._late, self._asker.not_confirmed(now)
         if bool(before) != bool(self._late):
             print(f"teleop: {self._late or 'the car is stopped'}", file=sys.stderr, flush=True)
+
+    def _say_unarmed(self, now: Now) -> None:
+        """Say in the terminal or the log why the car does not move although a button is held; each reason once a press."""
+        if self._mode == "idle" or self._estop:
+            self._held_ns, self._told_unarmed = now.mono_ns, ""
+            return
+        held_s = (now.mono_ns - self._held_ns) / NS_PER_S
+        if held_s > _REFUSED_S and self._unarmed not in ("", self._told_unarmed):
+            self._told_unarmed = self._unarmed
+            print(f"teleop: the car does not drive: {self._unarmed}", file=sys.stderr, flush=True)
 
     def _state(self, now: Now) -> Out:
         hands, config = self._hands, self._config

@@ -194,6 +194,24 @@ def test_the_estop_stays_until_re_armed_which_is_asked_for_a_moment_later(hand):
     assert hand.tick()[0].message.estop
 
 
+def test_a_held_button_that_does_not_arm_the_car_says_why_once_a_press(hand, capsys):
+    def hears(armed, reason):
+        state, now = filled(types.SafetyState, armed=armed, reason=reason), hand.clock.now()
+        hand.node.handle("/safety/state", state, MessageInfo(now.mono_ns, now.mono_ns), now)
+
+    hears(False, "not armed: no pose of the car yet")
+    hand.tick(0.4)
+    assert capsys.readouterr().err == ""  # nothing is held
+    for _ in range(10):
+        hand.does(human=True, throttle=1.0)
+        hand.tick(0.1)
+    assert capsys.readouterr().err == "teleop: the car does not drive: not armed: no pose of the car yet\n"
+    hears(True, "")
+    hand.does(human=True, throttle=1.0)
+    hand.tick(0.1)
+    assert capsys.readouterr().err == ""
+
+
 def test_an_estop_is_not_confirmed_until_the_motor_node_brakes(hand, capsys):
     _, (_, stop) = hand.does(stops=1)
     hand.tick(0.2)
