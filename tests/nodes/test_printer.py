@@ -16,7 +16,7 @@ from advnerf_core.geometry import invert_transform, look_at, make_transform, rot
 from calibration.by_construction import LAB_DATE
 from calibration.display_colour import DisplayCalibration
 from calibration.measured import LensCalibration
-from calibration.print_chart import make_chart
+from calibration.print_chart import chart_record, fit_printer, make_chart, printer_calibration
 from calibration.schema import load_calibration, save_calibration
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.world import Panel
@@ -95,6 +95,23 @@ def test_a_printer_whose_inks_are_known(call, tmp_path):
     assert code == 2
     assert "shorten the exposure" in said
     assert not (tmp_path / "no.yaml").exists()
+
+
+@pytest.mark.parametrize("aspect", [0.98, 1.02])
+def test_a_stretched_chart_gives_the_same_printer(aspect):
+    """Its fields are not where the nominal ones are; read there, colours were up to 14 of 255 off."""
+    sheet = make_chart("a4")
+    pixels, (width_m, height_m) = on_paper(sheet, 100.0)
+    picture = photograph(
+        [((pixels, (aspect * width_m, height_m)), before_camera(0.36, 12, 8, 2))],
+        LENS,
+        light=LIGHT,
+        black=0.0,
+    )
+    model = printer_calibration(fit_printer(picture, LENS, chart_record(sheet, 200.0)), "").display
+    colours = np.random.default_rng(7).uniform(0.0, 1.0, (500, 3))
+    error = model.forward(colours) - encoded(printed(colours) * LIGHT)
+    assert np.abs(error).max() < 2.0 / 255.0
 
 
 def test_search_print_hang_photograph_measure_and_drive_in_the_simulated_lab(call, tmp_path):
