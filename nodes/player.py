@@ -27,7 +27,7 @@ from nodes.runtime.messages import header, stamp_from_ns, types
 from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, ReaderThread
 from nodes.runtime.process import run_node_main
 from nodes.runtime.requests import Answer, AnswerMemory
-from nodes.runtime.topics import may_replay, type_of_topic
+from nodes.runtime.topics import STATUS_PREFIX, may_replay, status_topic, type_of_topic
 from nodes.runtime.topics import topic as topic_row
 
 _CONTROL, _STATE, _CLOCK = "/player/control", "/player/state", "/clock"
@@ -53,6 +53,8 @@ class PlayerConfig(StrictModel):
         clock_hz: Rate of ``/clock`` [Hz]; none for never.
         wait_for: Topics, by their played names, that must have a subscriber before the first message. None waits for a subscriber of
             any topic. An empty list does not wait; messages without a subscriber are lost.
+        wait_for_nodes: Nodes that must be ready before the first message: those that only see what others make of it are no subscribers of a
+            played topic.
     """
 
     bag: Path
@@ -65,6 +67,7 @@ class PlayerConfig(StrictModel):
     paused: bool = False
     clock_hz: float | None = Field(default=None, gt=0, le=_TICK_HZ)
     wait_for: list[str] | None = None
+    wait_for_nodes: list[str] = Field(default_factory=list)
 
 
 class PlayerNode(Node):
@@ -75,7 +78,7 @@ class PlayerNode(Node):
     """
 
     opens = "another bag"
-    subscriptions = (_CONTROL,)
+    subscriptions: tuple[str, ...] = (_CONTROL,)
     tick_rate_hz = _TICK_HZ
 
     def __init__(
@@ -98,6 +101,8 @@ class PlayerNode(Node):
                 raise BagError(
                     f"cannot wait for subscribers of {topic}, which is not played; played are {', '.join(self.publications)}"
                 )
+        self._unready = dict.fromkeys(map(status_topic, config.wait_for_nodes))
+        self.subscriptions = (_CONTROL, *self._unready)
         self._begin_ns = self._info.start_ns + round(config.start_offset_s * NS_PER_S)
         self._end_ns = self._info.end_ns
         if config.duration_s is not None:
@@ -124,7 +129,11 @@ class PlayerNode(Node):
         return cls(config, context.subscribers)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Execute a request once, and answer every repeat of it."""
+        """Execute a request once, and answer every repeat of it. Note which awaited nodes are ready."""
+        if topic != _CONTROL:
+            if message.state in (READY, ACTIVE):
+                self._unready.pop(topic, None)
+            return []
         outs: list[Out] = []
         ask_id = str(message.ask_id)
         if not self._answers.repeat(ask_id):
@@ -174,7 +183,7 @@ class PlayerNode(Node):
     def status(self) -> tuple[str, str]:
         """Report ready while waiting for subscribers."""
         if self._head is None and (missing := self._missing()):
-            return READY, f"waiting for subscribers of {', '.join(missing)}"
+            return READY, f"waiting for {', '.join(missing)}"
         words = [f"{self._played} messages played"]
         if self._left_out:
             words.append(f"not in the topic table: {', '.join(self._left_out)}")
@@ -262,7 +271,10 @@ class PlayerNode(Node):
             for topic in (self._played_names if wanted is None else wanted)
             if self._subscribers(topic) == 0
         ]
-        return [] if wanted is None and len(missing) < len(self._played_names) else missing
+        if wanted is None and len(missing) < len(self._played_names):
+            missing = []
+        nodes = [f"the node {topic.removeprefix(STATUS_PREFIX)}" for topic in self._unready]
+        return [*(f"subscribers of {topic}" for topic in missing), *nodes]
 
     def _rewind(self) -> None:
         self._messages = read_messages(

@@ -44,6 +44,8 @@ class PolicyNodeConfig(StrictModel):
         speed_mps: Speed of the commands [m/s].
         planned_speed: Drive at the speed that the policy's waypoints imply, at most ``speed_mps``. Predictions assume a constant speed.
         max_age_s: Largest age of an image since capture and since publication [s].
+        recorded: The images are those of a recording, so that their capture may be long ago: only the age since publication counts. The safety node
+            does not drive by such commands, because of their stamps.
         goal: Goal vector of a goal-conditioned policy.
     """
 
@@ -53,6 +55,7 @@ class PolicyNodeConfig(StrictModel):
     speed_mps: float = Field(default=0.8, ge=0.0, le=2.0)
     planned_speed: bool = False
     max_age_s: float = Field(default=0.15, gt=0.0, le=0.5)
+    recorded: bool = False
     goal: tuple[float, ...] = ()
 
 
@@ -91,7 +94,8 @@ class PolicyNode(Node):
         self._now_ns = now.mono_ns
         self._counts["images"] += 1
         capture_ns = stamp_ns(message)
-        captured_age_ns, published_age_ns = now.real_ns - capture_ns, now.mono_ns - info.publish_mono_ns
+        captured_age_ns = 0 if self._config.recorded else now.real_ns - capture_ns
+        published_age_ns = now.mono_ns - info.publish_mono_ns
         if max(captured_age_ns, published_age_ns) > self._max_age_ns:
             self._drop("dropped_stale", f"image is {max(captured_age_ns, published_age_ns) / 1e6:.0f} ms old")
             return []

@@ -1,20 +1,31 @@
+import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
 
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.policy_file import save_policy
+from advnerf_core.policies.view import PolicyView
+from calibration.schema import CameraCalibration, load_calibration
+from nodes.bags.reader import read_attachments, read_messages
 from nodes.bags.writer import BagWriter
 from nodes.player import PlayerConfig, PlayerNode
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import BagError, NodeFinished
 from nodes.runtime.messages import decode, encode, header, pose_message, stamp_ns, types
+from nodes.runtime.topics import topic as topic_row
 from tests.support.messages import filled
+from tests.support.replays import CORNER
 
 pytestmark = pytest.mark.live
+
+ROOT = Path(__file__).parents[2]
 
 START_NS = 1_800_000_000_000_000_000
 
@@ -43,6 +54,39 @@ def play(node, clock, step_s=0.01, steps=10_000):
     except NodeFinished:
         return out, True
     return out, False
+
+
+def test_the_workstation_launch_says_what_the_policy_would_have_steered(tmp_path):
+    """The whole launch file: pictures with stamps of another year become commands with these stamps."""
+    for name, content in read_attachments(CORNER).items():
+        (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    shutil.copy(ROOT / "calibration" / "twin" / "room.yaml", tmp_path)
+    camera = load_calibration(CameraCalibration, tmp_path / "camera.yaml")
+    view = PolicyView(camera.pinhole, 4, 20, distortion=camera.distortion)
+    save_policy(tmp_path / "policy.safetensors", PilotNet(), view, {})
+    parameters = {
+        "bag": CORNER,
+        "policy": tmp_path / "policy.safetensors",
+        "attack": tmp_path / "corner.attack.safetensors",
+        "calibration": tmp_path,
+    }
+    command = [sys.executable, "-m", "nodes.cli", "launch", "launch/workstation.launch.yaml"]
+    for name, value in parameters.items():
+        command += ["--set", f"params.{name}={value}"]
+    done = subprocess.run(
+        [*command, "--folder", tmp_path / "run"], cwd=ROOT, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    seen = {decoded_stamp(message) for message in read_messages(CORNER, ["/camera/image_raw"])}
+    steered = [
+        decoded_stamp(message) for message in read_messages(tmp_path / "run" / "bag", ["/policy/drive"])
+    ]
+    assert len(steered) > len(seen) // 2
+    assert set(steered) <= seen
+
+
+def decoded_stamp(message):
+    return stamp_ns(decode(topic_row(message.topic).type, message.cdr))
 
 
 def test_messages_come_when_they_are_due_and_then_it_is_done(bag):

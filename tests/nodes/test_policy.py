@@ -74,6 +74,15 @@ def test_stale_images_are_refused(captured_ms: int, published_ms: int) -> None:
     assert node.status()[0] == "active"
 
 
+def test_images_of_a_recording_may_be_old_or_of_a_clock_ahead_but_not_held_up() -> None:
+    node = _node(TorchDriver(_loaded()), recorded=True)
+    for captured_ms in (3_600_000, -3_600_000):
+        (out,) = _send(node, image_message(_rgb(), T0, "camera"), captured_ms, 2)
+        assert stamp_ns(out.message) == T0
+    assert _send(node, image_message(_rgb(), T0, "camera"), 30, 151) == []
+    assert node.status() == ("ready", "image is 151 ms old")
+
+
 def test_images_that_the_policy_does_not_know_are_a_fault() -> None:
     node = _node(TorchDriver(_loaded()))
     assert _send(node, image_message(_rgb(shape=(94, 168, 3)), T0, "camera")) == []
