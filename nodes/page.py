@@ -120,7 +120,8 @@ class PageNode(Node):
             self._operation.heard_safety(message, info)
         elif topic == topics.SENT:
             self._operation.heard_motor(message, info)
-        return []
+        # A trial is measured by every pose, as in a bag, and not only by those at the page's own ticks.
+        return self._operation.follow(now) if self._operates and topic in (topics.SAFETY, topics.CAR) else []
 
     def receive(self, item: ClientAct | Gone, now: Now) -> list[Out]:
         """Decide an act of a browser, or note that it has gone."""

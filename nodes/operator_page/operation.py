@@ -117,6 +117,13 @@ class Operation:
         """Note a report of the motor node."""
         self._asker.heard_motor(message, info)
 
+    def follow(self, now: Now) -> list[Out]:
+        """Continue a trial with what the board has just heard, and let go of the button at its end."""
+        seen = self.board.seen()
+        if self.trial.step(replace(seen, reason=self._why_ended or seen.reason), now.mono_ns):
+            return self._end_trial("the trial is over", now)
+        return []
+
     def stops(self) -> tuple[int, int]:
         """Number of requests to disarm, and the number up to which they are confirmed (any thread)."""
         return self._asker.stops_asked, self._asker.stops_confirmed
@@ -129,9 +136,7 @@ class Operation:
         lease = self.desk.lease
         if ended := self.desk.check(now.mono_ns):
             outs += self._ended(ended, lease.name if lease else "", now)
-        seen = self.board.seen()
-        if self.trial.step(replace(seen, reason=self._why_ended or seen.reason), now.mono_ns):
-            outs += self._end_trial("the trial is over", now)
+        outs += self.follow(now)
         if self._rearm_ns is not None and now.mono_ns >= self._rearm_ns:
             self._rearm_ns = None
             self._asker.arm(now, "e-stop reset on the page")

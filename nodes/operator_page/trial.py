@@ -14,7 +14,7 @@ import numpy as np
 
 from advnerf_core.driving.metrics import MOVED_M, Horizon, drive_metrics, states_at_ticks
 from advnerf_core.driving.path import Path as DrivingPath
-from nodes.control.stop_causes import is_result
+from nodes.control.stop_causes import is_result, safety_silence
 from nodes.runtime.clock import NS_PER_S
 
 IDLE, WAITING, RUNNING, DONE = "idle", "waiting", "running", "done"
@@ -66,6 +66,7 @@ class Trial:
         self._attack_ids: list[str] = []
         self._result: dict[str, Any] = {}
         self._stopped, self._stopped_s = "", math.inf
+        self._safety_ns = self._heard_ns = 0
 
     def start(self) -> None:
         """Begin a new trial, which waits for the car to be armed and to move."""
@@ -73,7 +74,9 @@ class Trial:
         self.phase, self.number = WAITING, self.number + 1
 
     def step(self, seen: Seen, mono_ns: int) -> bool:
-        """Continue the trial. Returns whether it has just ended."""
+        """Continue the trial, with every pose and every report of the safety node. Returns whether it has just ended."""
+        if seen.safety_ns != self._safety_ns:
+            self._safety_ns, self._heard_ns = seen.safety_ns, mono_ns
         if self.phase == WAITING and seen.pose is not None:
             position_m = seen.pose[1:]
             self._armed_at_m = (self._armed_at_m or position_m) if seen.armed else None
@@ -86,13 +89,17 @@ class Trial:
         if seen.pose is not None and seen.pose[0] > self._poses[-1][0]:
             self._poses.append(seen.pose)
         length_s = self._horizon.ticks * self._horizon.dt_s
-        if seen.armed:
+        if silence := safety_silence(self._heard_ns, mono_ns) if seen.armed else "":
+            self._stopped, self._stopped_s = silence, self._since_start_s(seen.safety_ns)
+        elif seen.armed:
             late = (mono_ns - self._began_ns) / NS_PER_S > length_s + _PATIENCE_S
             if not late and self._since_start_s(self._poses[-1][0]) < length_s:
                 return False
         else:
             self._stopped_s = self._since_start_s(seen.safety_ns)
-            self._stopped = seen.reason if self._stopped_s < length_s else ""
+            # A fault that took away the last poses ended the drive, also if the car was disarmed a moment after its end.
+            lost = self._since_start_s(self._poses[-1][0]) < length_s and not is_result(seen.reason)
+            self._stopped = seen.reason if lost or self._stopped_s < length_s else ""
         self.end()
         return True
 

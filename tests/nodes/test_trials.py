@@ -199,8 +199,9 @@ def write_bag(folder, drives, offset_m=0.1, rate_hz=100):
     for stand_s, drive_s, reason in drives:
         state(False, "not armed since the start")
         for k in range(round((stand_s + drive_s) * rate_hz)):
-            if k == round(stand_s * rate_hz) - 5:
-                state(True)
+            armed_from = round(stand_s * rate_hz) - 5
+            if k == armed_from or k % (rate_hz // 10) == 0:
+                state(k >= armed_from, "" if k >= armed_from else "not armed since the start")
             t += 1.0 / rate_hz
             x = -0.9 + 0.8 * max(0.0, (k + 1) / rate_hz - stand_s)
             put("/vicon/car", pose_message(planar_pose(x, -2.0 + offset_m, 0.0), START_NS + round(t * 1e9)))
@@ -291,6 +292,22 @@ def test_a_drive_that_a_fault_of_the_stack_ended_is_no_result_of_a_bag_either(tm
     assert whole["counts"]
     shown = CliRunner().invoke(app, ["bag", "evaluate", str(bag), "--ticks", "20"], env={"COLUMNS": "240"})
     assert f"{said}, after 9 ticks" in shown.stdout
+
+
+@pytest.mark.parametrize("returns", [True, False])
+def test_a_drive_ends_where_the_safety_node_falls_silent(tmp_path, returns):
+    """Frozen, it says nothing, the motor node brakes, and the car that stands was measured as if it had been driven to the end."""
+    bag = write_bag(tmp_path, [(1.0, 1.5, "the safety node was held up for 1.00 s")])
+    start_ns = find_drives(bag)[0].start_real_ns
+    frozen = range(start_ns + NS_PER_S // 2, start_ns + NS_PER_S * (14 if returns else 15) // 10)
+    held = copied(
+        bag, tmp_path / "held", lambda each: each.topic != "/safety/state" or each.log_ns not in frozen
+    )
+    (found,) = evaluate_bag(held, None, ticks=14)
+    assert (found["counts"], found["total_cte_m"]) == (False, None)
+    assert found["driven_ticks"] == 9  # half a second after its last report
+    silent_s = "1.0" if returns else "2.0"  # until its next report, or the last pose
+    assert found["stopped_early"] == f"no message from the safety node for {silent_s} s"
 
 
 def test_a_bag_that_cannot_be_evaluated_leaves_the_others_their_rows(tmp_path):
@@ -415,9 +432,10 @@ def test_poses_that_are_missing_cost_their_drive_alone_and_the_cause_is_told(
     expected, second = evaluate_bag(bag, None, ticks=20), find_drives(bag)[1]
     gap = range(second.end_real_ns - NS_PER_S * 9 // 10, second.end_real_ns - NS_PER_S // 10)
     files = {**read_attachments(bag), **({"launch.resolved.yaml": RELAYED.encode()} if relayed else {})}
+    hidden = ("/vicon/car",) if others_heard or not relayed else ("/vicon/car", "/safety/state")
     with BagWriter(tmp_path / "lost", files) as writer:
         for number, each in enumerate(read_messages(bag)):
-            if each.topic != "/vicon/car" or each.log_ns not in gap:
+            if each.topic not in hidden or each.log_ns not in gap:
                 writer.write(each.topic, each.cdr, each.log_ns, each.log_ns, number)
             elif others_heard:
                 odom = encode(filled(types.Odometry, header=header(each.log_ns)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from nodes.bags.one_clock import require_one_clock
 from nodes.bags.reader import read_attachment, read_attachments, read_info, read_messages
 from nodes.bags.time_gaps import skipped_gaps
 from nodes.control.arming_gates import NOT_HELD
-from nodes.control.stop_causes import is_result
+from nodes.control.stop_causes import SAFETY_SILENT_S, is_result, safety_silence
 from nodes.lab.trials.evaluation import SHOWN_BY, attack_ids, counterfactual, score, timing, trajectory
 from nodes.launching.launched import facts_of
 from nodes.runtime.clock import NS_PER_S
@@ -64,12 +64,12 @@ def find_drives(bag: Path) -> list[DriveSpan]:
     """
     _require(bag, (_SAFETY, _CAR))
     require_one_clock(bag, (_SAFETY, _CAR))
-    armings = _armings(bag)
+    stamps, xy = _positions(bag)
+    armings = _armings(bag, int(stamps[-1]) if len(stamps) else 0)
     if not armings:
         raise BagError(
             f"expected a bag in which the car is armed, got no armed state on /safety/state in {bag}; give the bag of a drive"
         )
-    stamps, xy = _positions(bag)
     spans, begun_late = list[DriveSpan](), False
     gaps, let_go = skipped_gaps(bag), _made_to_let_go(bag)
     for arming in armings:
@@ -157,10 +157,13 @@ def measure_drive(
 
 def _without_poses(bag: Path, span: DriveSpan, horizon: Horizon, gap: PoseGapError) -> dict[str, Any]:
     """A drive that does not count, because poses are missing at its control ticks."""
+    gap_s = (gap.after_ns - gap.before_ns) / NS_PER_S
     return {
         "attack_ids": sorted(attack_ids(bag, SHOWN_BY, span.start_real_ns, span.end_real_ns)),
         "states": [],
-        "stopped_early": _why_no_poses(bag, gap),
+        "stopped_early": _why_silent(
+            bag, _CAR, gap.before_ns, gap.after_ns, f"the car was not tracked for {gap_s:.1f} s"
+        ),
         "counts": False,
         "driven_ticks": horizon.whole_ticks((gap.before_ns - span.start_real_ns) / NS_PER_S),
         "cte_m": [],
@@ -168,14 +171,14 @@ def _without_poses(bag: Path, span: DriveSpan, horizon: Horizon, gap: PoseGapErr
     }
 
 
-def _why_no_poses(bag: Path, gap: PoseGapError) -> str:
-    """Whether the car was not tracked, or the recorder received none of the topics of the poses' host."""
-    gap_s, edge_ns = (gap.after_ns - gap.before_ns) / NS_PER_S, round(_EDGE_S * NS_PER_S)
-    silent = range(gap.before_ns + edge_ns, gap.after_ns - edge_ns)
+def _why_silent(bag: Path, topic: str, before_ns: int, after_ns: int, silent: str) -> str:
+    """Whether a topic was silent between two of its messages, as ``silent`` says, or the recorder received none of the topics of its host."""
+    gap_s, edge_ns = (after_ns - before_ns) / NS_PER_S, round(_EDGE_S * NS_PER_S)
+    within = range(before_ns + edge_ns, after_ns - edge_ns)
     relayed = _relayed(bag)
     heard = read_messages(bag, relayed, as_recorded=True)
-    if _CAR not in relayed or any(each.log_ns in silent for each in heard):
-        return f"the car was not tracked for {gap_s:.1f} s"
+    if topic not in relayed or any(each.log_ns in within for each in heard):
+        return silent
     return f"the recorder received nothing from the other host for {gap_s:.1f} s"
 
 
@@ -235,20 +238,44 @@ class _Arming(NamedTuple):
     is_seen: bool
 
 
-def _armings(bag: Path) -> list[_Arming]:
-    """When the car was armed [ns, CLOCK_REALTIME], and why it was disarmed."""
+def _armings(bag: Path, end_ns: int) -> list[_Arming]:
+    """When the car was armed [ns, CLOCK_REALTIME], and why it was disarmed; ``end_ns`` is the stamp of the last pose."""
     found: list[_Arming] = []
     since_ns: int | None = None
     disarmed = False
-    for state in read_decoded(bag, _SAFETY):
-        at_ns = stamp_ns(state)
-        if state.armed and since_ns is None:
+    for at_ns, armed, reason in _safety_states(bag, end_ns):
+        if armed and since_ns is None:
             since_ns = at_ns
-        elif not state.armed:
+        elif not armed:
             if since_ns is not None:
-                found.append(_Arming(since_ns, at_ns, str(state.reason), disarmed))
+                found.append(_Arming(since_ns, at_ns, reason, disarmed))
             since_ns, disarmed = None, True
     return found if since_ns is None else [*found, _Arming(since_ns, None, "", disarmed)]
+
+
+def _safety_states(bag: Path, end_ns: int) -> Iterator[tuple[int, bool, str]]:
+    """Time [ns, CLOCK_REALTIME], whether armed, and why not, of each report of the safety node.
+
+    A car whose safety node falls silent is disarmed then, as its motor node brakes, until the node reports a disarmed car.
+    """
+    armed_ns: int | None = None
+    lost = False
+    for state in read_decoded(bag, _SAFETY):
+        at_ns, armed = stamp_ns(state), bool(state.armed)
+        if armed_ns is not None and (silence := safety_silence(armed_ns, at_ns)):
+            yield _silent(bag, armed_ns, at_ns, silence)
+            lost = True
+        lost = lost and armed
+        if not lost:
+            yield at_ns, armed, str(state.reason)
+        armed_ns = at_ns if armed and not lost else None
+    if armed_ns is not None and (silence := safety_silence(armed_ns, end_ns)):
+        yield _silent(bag, armed_ns, end_ns, silence)
+
+
+def _silent(bag: Path, armed_ns: int, heard_ns: int, silence: str) -> tuple[int, bool, str]:
+    why = _why_silent(bag, _SAFETY, armed_ns, heard_ns, silence)
+    return armed_ns + round(SAFETY_SILENT_S * NS_PER_S), False, why
 
 
 def _made_to_let_go(bag: Path) -> list[tuple[int, str]]:

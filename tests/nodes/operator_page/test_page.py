@@ -6,14 +6,24 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from advnerf_core.driving.metrics import Horizon, drive_metrics, states_at_ticks
+from advnerf_core.geometry import planar_pose
+from calibration.schema import RoomCalibration, load_calibration
+from nodes.runtime.clock import ManualClock
+from nodes.runtime.messages import header, pose_message, types
+from nodes.runtime.node import MessageInfo, NodeContext
 
 pytest.importorskip("uvicorn")
 pytest.importorskip("starlette")
 pytest.importorskip("websockets")
 
+from nodes.page import PageConfig, PageNode
 from tests.support.live.page_client import Browser, cookie_of, request
-from tests.support.page import IN_TIME, Run
+from tests.support.messages import filled
+from tests.support.page import IN_TIME, TWIN, Run
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.live
@@ -251,6 +261,40 @@ def test_a_trial_runs_from_the_first_motion_and_is_measured(tmp_path):
         ann.close()
     finally:
         run.close()
+
+
+def test_a_trial_is_measured_by_every_pose_and_not_by_those_at_the_pages_own_ticks(tmp_path):
+    """The total is that of the bag: the same start, the same states at the same ticks."""
+    run, clock = Run(tmp_path), ManualClock(10**10, 1_800_000_000_000_000_000)
+    config = PageConfig.model_validate(run.configs["page"])
+    node = PageNode.build(config, NodeContext("page", tmp_path, clock))
+    horizon, room = Horizon(config.trial_ticks), load_calibration(RoomCalibration, TWIN / "room.yaml")
+    stamps, poses = [], []
+    try:
+        node._operation.trial.start()
+        for ms in range(0, 6600, 10):
+            now = clock.now()
+            info = MessageInfo(now.mono_ns, now.mono_ns)
+            if ms % 100 == 0:
+                state = filled(types.SafetyState, header=header(now.real_ns), armed=ms >= 100)
+                node.handle("/safety/state", state, info, now)
+            moving_s = max(0, ms - 200) / 1000
+            x_m, y_m = 0.8 * moving_s, -2.0 + 0.1 * np.sin(7.0 * moving_s)
+            pose = pose_message(planar_pose(x_m, y_m, 0.0), now.real_ns)
+            node.handle("/vicon/car", pose, info, now)
+            if stamps or np.hypot(x_m, y_m + 2.0) > 0.01:  # a centimetre from where it was armed
+                stamps.append(now.real_ns)
+                poses.append((x_m, y_m, 0.0))
+            if ms % 170 == 0:
+                node.tick(now)
+            clock.advance(0.01)
+        shown = node._operation.trial.state()
+    finally:
+        node.close()
+    states = states_at_ticks(np.array(stamps), np.array(poses), stamps[0], horizon)
+    expected = drive_metrics(room.reference_path, states, horizon)
+    assert (shown["phase"], shown["ticks"]) == ("done", horizon.ticks)
+    assert shown["total_cte_m"] == pytest.approx(expected.total_cte_m, abs=1e-9)
 
 
 def test_another_attack_waits_for_the_end_of_a_trial(tmp_path):

@@ -125,6 +125,33 @@ def test_a_trial_that_a_fault_of_the_stack_ended_is_no_result(reason, counts):
     assert ("total_cte_m" in state) is counts
 
 
+def test_a_safety_node_that_says_nothing_any_more_ended_the_trial():
+    trial = Trial(Path.rounded_square(4.0, 1.0), 0.4, ticks=60)
+    trial.start()
+    armed_at(trial, (0.0, -2.3))
+    for ms in range(0, 3000, 20):
+        pose = (EPOCH_NS + ms * MS, 0.0, -2.3)
+        if trial.step(Seen(True, EPOCH_NS + min(ms, 1000) * MS, pose), ms * MS):
+            break
+    state = trial.state()
+    assert (ms, state["ticks"], state["counts"], "total_cte_m" in state) == (1520, 10, False, False)
+    assert state["stopped"] == "no message from the safety node for 0.5 s"
+
+
+@pytest.mark.parametrize(
+    ("reason", "counts"), [("no pose of the car for 0.22 s", False), ("the button is not held", True)]
+)
+def test_a_fault_that_took_the_last_poses_is_no_result_though_it_disarmed_after_the_end(reason, counts):
+    """As in a bag, where the last tick lies in the gap."""
+    trial = Trial(Path.rounded_square(4.0, 1.0), 0.4, ticks=20)
+    trial.start()
+    armed_at(trial, (0.0, -2.3))
+    for ms in range(0, 2010, 10):
+        assert not step(trial, True, (0.0, -2.3), "", ms, pose_ms=min(ms, 1950))
+    assert step(trial, False, (0.0, -2.3), "", 2060, reason, pose_ms=1950)
+    assert (trial.state()["counts"], trial.state()["stopped"]) == (counts, "" if counts else reason)
+
+
 def test_without_a_path_it_only_counts():
     trial = Trial(None, 0.4, ticks=3)
     trial.start()
