@@ -12,7 +12,7 @@ from advnerf_core.report.evidence.registration import launch_file
 # Name of what computes the rows again, and the commands; groups are its arguments.
 KEPT_COMMANDS: dict[str, re.Pattern[str]] = {
     "retraining": re.compile(
-        r"advnerf experiment run (launch/junction\.experiment\.yaml) --setting (retrain) --folder (\S+)"
+        r"advnerf experiment run launch/junction\.experiment\.yaml --setting retrain --folder \S+"
     ),
     "gap": re.compile(r"python -m benchmarks\.gap ([\w ]+)"),
     "predictions": re.compile(r"python -m benchmarks\.predictions"),

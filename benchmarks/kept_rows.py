@@ -6,26 +6,20 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from advnerf_core.documents import read_json
 from advnerf_core.report.evidence.verifying.numbers import same
 from benchmarks import gap, paper_table, predictions, retraining, transfer_correlation, victim_panel
 from benchmarks.kept_commands import kept_by
 from benchmarks.results import REPOSITORY, LedgerRow
-from nodes.experiment.steps.run import load_experiment
 
 PUBLISHED = REPOSITORY / "docs" / "results"
 _COMPARED = ("value", "unit", "target", "met", "note")
 
 
-def retraining_rows(file: str, setting: str, folder: str) -> list[LedgerRow]:
+def retraining_rows() -> list[LedgerRow]:
     """Rows of the rounds of attack and retraining."""
-    experiment = load_experiment(REPOSITORY / file, setting, [], REPOSITORY / folder)
-    allowed = experiment.config.retrain.rounds if experiment.config.retrain else 0
-    command = retraining.command_of(experiment)
-    summary = read_json(PUBLISHED / "retrain" / "retrain.json")
     return [
-        LedgerRow(line, value, unit, target, met, command, note)
-        for line, value, unit, target, met, note in retraining.rows_of(summary, allowed)
+        LedgerRow(line, value, unit, target, met, retraining.COMMAND, note)
+        for line, value, unit, target, met, note in retraining.rows_of(retraining.kept_summaries())
     ]
 
 

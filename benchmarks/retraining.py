@@ -1,65 +1,86 @@
 """Question: does retraining on found attacks cure the policy, and for how long? ``python -m benchmarks.retraining RUN_FOLDER``.
 
-Reads what ``advnerf experiment run launch/junction.experiment.yaml --setting retrain`` wrote; computes nothing anew.
+Reads what ``advnerf experiment run launch/junction.experiment.yaml --setting retrain`` wrote; computes nothing anew. Runs with other seeds are added
+with ``--seed``.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from benchmarks.results import REPOSITORY, record_row
-from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import victim_spec
 from nodes.experiment.steps import retrain_plot
 from nodes.experiment.steps.run import load_experiment
 
 _TARGET = 1.1
+_DRIVES = ("original_undisturbed", "original_attacked", "retrained_undisturbed", "retrained_attacked")
+COMMAND = "advnerf experiment run launch/junction.experiment.yaml --setting retrain --folder runs/retrain"
+Row = tuple[str, float, str, str, bool | None, str]  # line, value, unit, target, met, note
+_KEPT = REPOSITORY / "docs" / "results" / "retrain"
 
 
-def rows_of(summary: dict[str, Any], allowed: int) -> list[tuple[str, float, str, str, bool | None, str]]:
-    """Rows of the ledger: the retrained policy under the old attacks, and what attacks on each round's policy are worth; ``allowed`` rounds may be run."""
-    rows: list[tuple[str, float, str, str, bool | None, str]] = []
-    for name, drive in summary["old_attacks"].items():
-        note = (
-            f"one seed, one start that nothing has seen, deployed: original undisturbed {drive['original_undisturbed_m']:.2f} m, attacked "
-            f"{drive['original_attacked_m']:.2f} m; retrained undisturbed {drive['retrained_undisturbed_m']:.2f} m, attacked {drive['retrained_attacked_m']:.2f} m"
+def kept_summaries() -> list[dict[str, Any]]:
+    """What was found with each seed; the first one's policies are kept too."""
+    return [read_json(file) for file in (_KEPT / "retrain.json", *sorted(_KEPT.glob("seed_*.json")))]
+
+
+def rows_of(seeds: Sequence[dict[str, Any]]) -> list[Row]:
+    """Rows of the ledger, means over seeds: the retrained policies under the old attacks, and what attacks on each round's policies are worth."""
+    rows = list[Row]()
+    for name in seeds[0]["old_attacks"]:
+        drives = [each["old_attacks"][name] for each in seeds]
+        totals = (
+            f"{part.replace('_', ' ')} {_each([drive[f'{part}_m'] for drive in drives], 2)} m"
+            for part in _DRIVES
         )
+        ratios = [drive["ratio"] for drive in drives]
         line = f"retrained once, under the old attack, {name}, over the original undisturbed"
-        rows.append((line, drive["ratio"], "x", f"<= {_TARGET} x", drive["ratio"] <= _TARGET, note))
-    for number, each in enumerate(summary["rounds"]):
-        for name in each["surrogate"]:
-            line = f"attack on the policy after {number} round{'s' * (number != 1)} of retraining, {name}, deployed"
-            note = f"in the learned scene {each['surrogate'][name]:.3f} m; victim {each['victim'][:12]}, gradient, one seed"
-            if number == len(summary["rounds"]) - 1 and max(each["surrogate"].values()) > summary["pays_m"]:
-                ended = (
-                    "the number of rounds ended the loop"
-                    if number >= allowed
-                    else f"the loop was stopped before its {allowed} rounds were over"
-                )
-                note += (
-                    f"; {ended}: an attack pays above {summary['pays_m']:g} m per tick in the learned scene"
-                )
-            rows.append((line, each["deployed"][name], "m per tick of excess", "", None, note))
+        note = (
+            f"each seed: {_each(ratios, 3)}; one start that nothing has seen, deployed: {'; '.join(totals)}"
+        )
+        rows.append(
+            (line, float(np.mean(ratios)), "x", f"<= {_TARGET} x", bool(np.mean(ratios) <= _TARGET), note)
+        )
+    for number in range(max(len(each["rounds"]) for each in seeds)):
+        rows += _round_rows(number, [each for each in seeds if number < len(each["rounds"])])
     return rows
 
 
-def command_of(experiment: Experiment) -> str:
-    """What makes these rounds: the manifest's command may be of something else that has used the run folder since."""
-    file = experiment.file.relative_to(REPOSITORY)
-    folder = os.path.relpath(experiment.folder, REPOSITORY)
-    return f"advnerf experiment run {file} --setting {experiment.setting} --folder {folder}"
+def _round_rows(number: int, seeds: Sequence[dict[str, Any]]) -> list[Row]:
+    rounds, rows = [each["rounds"][number] for each in seeds], list[Row]()
+    paying = sum(
+        max(each["surrogate"].values()) > seed["pays_m"] for each, seed in zip(rounds, seeds, strict=True)
+    )
+    for name in rounds[0]["surrogate"]:
+        deployed_m = [each["deployed"][name] for each in rounds]
+        note = (
+            f"each seed: {_each(deployed_m, 3)} m; in the learned scene {_each([each['surrogate'][name] for each in rounds], 3)} m; gradient, victims "
+            f"{', '.join(each['victim'][:12] for each in rounds)}; an attack pays on {paying} of {len(seeds)}: above {seeds[0]['pays_m']:g} m per tick in "
+            "the learned scene, on any path"
+        )
+        line = (
+            f"attack on the policy after {number} round{'s' * (number != 1)} of retraining, {name}, deployed"
+        )
+        rows.append((line, float(np.mean(deployed_m)), "m per tick of excess", "", None, note))
+    return rows
+
+
+def _each(values: Sequence[float], digits: int) -> str:
+    return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
 def publish(found: Path, original: Path, docs: Path) -> None:
-    """The rounds, the attacked policies and the curve into the documentation."""
+    """The rounds, the attacked policies and the curve of the first seed into the documentation."""
     text, kept = (found / "retrain.json").read_text(), docs / "results" / "retrain"
-    summary = json.loads(text)
+    summary = read_json(found / "retrain.json")
     write_atomically(kept / "retrain.json", text)
     for number in range(len(summary["rounds"])):
         file = found / f"round{number - 1}" / "policy.safetensors" if number else original
@@ -68,24 +89,25 @@ def publish(found: Path, original: Path, docs: Path) -> None:
 
 
 def main() -> None:
-    """Record the rows, and put rounds and curve into docs/."""
+    """Put rounds and curve into docs/, and record the rows of all seeds."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("folder", type=Path, help="run folder of the intersection's experiment")
-    parser.add_argument("--dry", action="store_true", help="print only")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="its seed; above 0: a further one, whose policies are not kept"
+    )
     options = parser.parse_args()
     experiment = load_experiment(
         REPOSITORY / "launch" / "junction.experiment.yaml", "retrain", [], options.folder
     )
     found = experiment.stage_folder("retrain")
-    summary = read_json(found / "retrain.json")
-    allowed = experiment.config.retrain.rounds if experiment.config.retrain else 0
-    for line, value, unit, target, met, note in rows_of(summary, allowed):
-        print(f"{line}: {value:.2f} {unit} (target {target or '-'}): {met}")
-        if not options.dry:
-            record_row(line, value, unit, target, met, command_of(experiment), note)
-    if not options.dry:
+    if options.seed:
+        write_atomically(_KEPT / f"seed_{options.seed}.json", (found / "retrain.json").read_text())
+    else:
         original = Path(victim_spec(experiment, experiment.config.main_victim))
         publish(found, original, REPOSITORY / "docs")
+    for line, value, unit, target, met, note in rows_of(kept_summaries()):
+        print(f"{line}: {value:.2f} {unit} (target {target or '-'}): {met}")
+        record_row(line, value, unit, target, met, COMMAND, note)
 
 
 if __name__ == "__main__":
