@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.attack.artifact import AttackFile
+from calibration.placement import require_same_corners
 from calibration.schema import CalibrationError, TargetCalibration
 
 Rgb = NDArray[np.uint8]
@@ -85,13 +86,14 @@ def make_panel(
 
 
 def require_fits(attack: AttackFile, panel: MonitorPanel, target: TargetCalibration) -> None:
-    """Raise for an attack that this panel cannot show exactly: another carrier, too large, or off the centre."""
+    """Raise for an attack that this panel cannot show exactly: another carrier, turned, too large, or off the centre."""
     face = attack.face
     if face is None or face.subject != target.subject:
         what = f"for {face.subject}" if face is not None else "without a face"
         raise CalibrationError(
             f"attack {attack.attack_id} is {what}, but this is {target.subject}: search one for it"
         )
+    require_same_corners(attack, target)
     if max(face.size_m) > panel.square_m * (1.0 + _FIT_TOLERANCE):
         raise CalibrationError(
             f"attack {attack.attack_id} is {face.size_m[0]:.3f} x {face.size_m[1]:.3f} m, more than the {panel.square_m:.3f} m of "

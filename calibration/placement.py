@@ -1,4 +1,4 @@
-"""Compares the pose of the board or monitor with its attack's, and says how to move it."""
+"""Compares the corners and the pose of the board or monitor with its attack's, and says how to correct or move it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from advnerf_core.attack.artifact import AttackFile
-from advnerf_core.geometry import Array, invert_transform, make_transform, yaw_of
-from calibration.schema import CalibrationError, TargetCalibration
+from advnerf_core.attack.artifact import AttackFace, AttackFile
+from advnerf_core.geometry import Array, invert_transform, make_transform, wrap_angle, yaw_of
+from calibration.schema import CORNERS, CalibrationError, TargetCalibration
+
+# Of the corners of one face in one frame: a wand's error is smaller, another corner or a redefined subject further off.
+_SAME_DIRECTION_RAD = float(np.deg2rad(10.0))
+_SAME_MIDDLE = 0.05  # of the diagonal
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,41 @@ def face_frame(corners_m: Array) -> Array:
     up = up / np.linalg.norm(up)
     # The viewer's right is the face's y axis (its left is -y), so x = y cross z points at the viewer.
     return make_transform(np.stack([np.cross(right, up), right, up], axis=1), corners_m.mean(axis=0))
+
+
+def require_same_corners(attack: AttackFile, target: TargetCalibration) -> None:
+    """Raise for a target with the corners of the attack's face in another order, by which it would be shown turned or mirrored.
+
+    A subject may have been redefined since the search, with another origin or other axes. Then its corners have another middle or lie in
+    another plane, nothing is known of their order, and they are accepted.
+
+    Raises:
+        AttackFileError: The attack has no face.
+        CalibrationError: Middle and plane are the same, but the directions differ by more than 10 degrees.
+    """
+    if got := _another_order(attack.required_face(), target):
+        raise CalibrationError(
+            f"expected corners_in_subject_m of target {target.subject} in the order {', '.join(CORNERS)}, as seen from the front, as in attack "
+            f"{attack.attack_id}, got {got}; correct the target file, or search an attack for it if the subject was redefined"
+        )
+
+
+def _another_order(face: AttackFace, target: TargetCalibration) -> str:
+    """How the corners of a target contradict those of an attack's face; empty if they do not."""
+    off = invert_transform(face_frame(face.corners_in_subject)) @ face_frame(target.corners)
+    diagonal_m = np.linalg.norm(face.corners_in_subject[2] - face.corners_in_subject[0])
+    outward, rolled_rad = off[0, 0], np.arctan2(off[2, 1], off[1, 1])
+    if np.linalg.norm(off[:3, 3]) > _SAME_MIDDLE * diagonal_m or abs(outward) < np.cos(_SAME_DIRECTION_RAD):
+        return ""
+    if outward < 0.0:
+        return "them mirrored: they go the other way round"
+    if abs(rolled_rad) <= _SAME_DIRECTION_RAD:
+        return ""
+    later = round(-rolled_rad / (0.5 * np.pi)) % 4
+    if abs(wrap_angle(rolled_rad + later * 0.5 * np.pi)) > _SAME_DIRECTION_RAD:
+        return f"a face turned by {abs(np.rad2deg(rolled_rad)):.0f} degrees in its plane"
+    turned = "upside down" if later == 2 else "on its side"
+    return f"a face {turned}: they begin {later} corner{'s' * (later > 1)} later, at the {CORNERS[later]} one"
 
 
 def misplacement(attack: AttackFile, target: TargetCalibration, T_world_from_subject: Array) -> Misplacement:

@@ -16,7 +16,7 @@ from advnerf_core.driving.path import Arc, Path
 from advnerf_core.geometry import Array, invert_transform, transform_points, wrap_angle
 from calibration.degeneracy import DegenerateDataError
 from calibration.path_fit import require_a_way
-from calibration.schema import TargetCalibration, measured
+from calibration.schema import CORNERS, TargetCalibration, measured
 
 _CELL_M = 0.01
 _LARGEST_ROOM_M = 50.0
@@ -28,7 +28,6 @@ _UPRIGHT = 0.5
 # A wand that is on the average farther behind the face than this part of its height was not held from the front.
 _BEHIND = 0.05
 _RECTANGLE_M = 0.01
-CORNERS = ("top left", "top right", "bottom right", "bottom left")
 
 
 def fence_from_trace(trace: ArrayLike, margin_m: float) -> tuple[tuple[float, float], ...]:

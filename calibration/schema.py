@@ -45,6 +45,8 @@ _LONGEST_WHEELBASE_M, _MOST_LATENCY_S = 8.0, 1.0
 _SKEW = 0.1
 # Of a fence to the extent of the path: a room is not that much larger.
 _MOST_ROOM = 25.0
+CORNERS = ("top left", "top right", "bottom right", "bottom left")
+"""Order of a face's corners, as seen from the front."""
 BY_CONSTRUCTION = "by construction"
 """Method of the simulated car's files, which nobody measured."""
 _OPTIONAL = ("views", "residuals", "response")

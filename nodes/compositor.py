@@ -16,13 +16,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from pydantic import Field, field_validator
 
 from advnerf_core.attack.artifact import AttackFile, load_attack
 from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.geometry import Array, invert_transform
 from advnerf_core.strict import StrictModel
+from calibration.panel import target_size
+from calibration.placement import require_same_corners
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
 from nodes.control.attack_receiver import ATTACK_FILE, AttackReceiver
 from nodes.control.interlock import ATTACK_SWITCH, SAFETY_STATE, AttackSwitch, Interlock
@@ -256,22 +257,23 @@ class CompositorNode(Node):
 def show(
     attack: AttackFile, camera: CameraCalibration, target: TargetCalibration, supersample: int = 2
 ) -> Showing:
-    """Prepare an attack for a camera and a face. An attack without a face, or for a face of another size or subject, is refused.
+    """Prepare an attack for a camera and a face. An attack without a face, or for a face of another size or subject, or turned, is refused.
 
     The camera may have another size than the attack's, which is that of the images its policy saw.
     """
-    face = attack.required_face()
-    corners = target.corners
-    size_m = (np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(corners[3] - corners[0]))
+    face, size_m = attack.required_face(), target_size(target)
+    same_subject = face.subject == target.subject
+    if same_subject:
+        require_same_corners(attack, target)
     wrong_size = any(
         abs(got / want - 1.0) > _SIZE_TOLERANCE for got, want in zip(size_m, face.size_m, strict=True)
     )
-    if wrong_size or face.subject != target.subject:
+    if wrong_size or not same_subject:
         raise ConfigError(
             f"attack {attack.attack_id} was made for {face.subject}, {face.size_m[0]:.2f} x {face.size_m[1]:.2f} m, but the "
             f"target is {target.subject}, {size_m[0]:.2f} x {size_m[1]:.2f} m; name the target it was made for"
         )
-    overlay = FaceOverlay(face.texture, corners, camera.pinhole, camera.distortion, supersample)
+    overlay = FaceOverlay(face.texture, target.corners, camera.pinhole, camera.distortion, supersample)
     return Showing(attack.attack_id, overlay, camera.mount)
 
 

@@ -4,9 +4,9 @@ import pytest
 from advnerf_core.attack.artifact import face_texture
 from advnerf_core.driving.path import Arc, Line, Path
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.geometry import make_transform, planar_pose, rotation_z, transform_points
+from advnerf_core.geometry import make_transform, planar_pose, rotation_x, rotation_z, transform_points
 from calibration.degeneracy import DegenerateDataError
-from calibration.placement import face_frame, measured_pose, misplacement
+from calibration.placement import face_frame, measured_pose, misplacement, require_same_corners
 from calibration.room import (
     clearance,
     fence_around,
@@ -17,7 +17,7 @@ from calibration.room import (
     target_of_touches,
 )
 from calibration.schema import CalibrationError
-from tests.support.faces import face_attack, outward_normal
+from tests.support.faces import face_attack, outward_normal, reordered
 
 SQUARE = Path.rounded_square(4.0, 1.1)
 
@@ -185,7 +185,7 @@ def attack(T, size=1.0, subject="board"):
         size_m=(size, size),
         T_world_from_object=T,
         subject=subject,
-        corners_in_subject=np.zeros((4, 3)),
+        corners_in_subject=BOARD.corners,
     )
 
 
@@ -244,3 +244,42 @@ def test_the_measured_pose_is_what_a_request_needs():
 def test_an_attack_for_something_else_is_refused():
     with pytest.raises(CalibrationError, match="is for monitor, the target is board"):
         misplacement(attack(T_FACE, subject="monitor"), BOARD, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("order", "got"),
+    [
+        ((1, 2, 3, 0), "on its side: they begin 1 corner later, at the top right one"),
+        ((2, 3, 0, 1), "upside down: they begin 2 corners later, at the bottom right one"),
+        ((3, 0, 1, 2), "on its side: they begin 3 corners later, at the bottom left one"),
+        ((1, 0, 3, 2), "mirrored: they go the other way round"),
+        ((3, 2, 1, 0), "mirrored: they go the other way round"),
+        ((0, 3, 2, 1), "mirrored: they go the other way round"),
+    ],
+)
+def test_corners_in_another_order_than_the_attack_has_are_refused(order, got):
+    made = attack(T_FACE)
+    crooked = rotation_x(np.deg2rad(2.0))  # as a wand may measure it
+    touched = BOARD.model_copy(update={"corners_in_subject_m": tuple(map(tuple, BOARD.corners @ crooked))})
+    require_same_corners(made, touched)
+    with pytest.raises(CalibrationError, match=f"of target board in the order top left, .*, got .*{got}; "):
+        require_same_corners(made, reordered(touched, order))
+
+
+def test_corners_of_a_redefined_subject_are_accepted_if_they_may_be_right():
+    """Its origin and axes are free; a turn about the face's own middle and normal cannot be told from another order."""
+    made = attack(T_FACE)
+    for T in (
+        make_transform(np.eye(3), [0.0, 0.4, -0.3]),  # the origin at another marker
+        make_transform(rotation_x(np.pi), [0.0, 0.4, -0.3]),
+        make_transform(rotation_z(np.pi / 2), [0.03, 0.0, 0.2])
+        @ make_transform(np.eye(3), [-0.03, 0.0, -0.2]),
+    ):
+        rows = tuple(map(tuple, transform_points(T, BOARD.corners)))
+        require_same_corners(made, BOARD.model_copy(update={"corners_in_subject_m": rows}))
+    middle = BOARD.corners.mean(axis=0)
+    turned = middle + (BOARD.corners - middle) @ rotation_x(np.deg2rad(-30.0)).T
+    with pytest.raises(CalibrationError, match="got a face turned by 30 degrees in its plane; correct"):
+        require_same_corners(
+            made, BOARD.model_copy(update={"corners_in_subject_m": tuple(map(tuple, turned))})
+        )

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from advnerf_core.attack.artifact import AttackFileError, face_texture, save_attack
 from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.geometry import invert_transform, make_transform, planar_pose, rotation_z
-from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
+from calibration.schema import CalibrationError, CameraCalibration, TargetCalibration, load_calibration
 from nodes.compositor import CompositorConfig, CompositorNode
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import ConfigError
@@ -18,7 +18,7 @@ from nodes.runtime.messages import decode, encode, image_message, pose_message, 
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.transfer import chunk_messages
-from tests.support.faces import face_attack
+from tests.support.faces import face_attack, reordered
 
 pytestmark = pytest.mark.live
 
@@ -271,6 +271,14 @@ def test_build_reads_the_files_and_refuses_wrong_ones(tmp_path):
         CompositorConfig(atack=path, **files)
 
 
+@pytest.mark.parametrize("order", [(1, 2, 3, 0), (2, 3, 0, 1), (1, 0, 3, 2)])
+def test_a_target_with_the_corners_of_the_attack_in_another_order_is_refused(order):
+    """It was drawn turned, and measured as the attack."""
+    files = {"camera": CALIBRATION / "camera.yaml", "target": CALIBRATION / "board.yaml"}
+    with pytest.raises(CalibrationError, match="expected corners_in_subject_m of target board in the order"):
+        CompositorNode(CompositorConfig(**files), CAMERA, reordered(TARGET, order), attack())
+
+
 def file_of(tmp_path, **changes):
     save_attack(tmp_path / "new.safetensors", attack(**changes))
     return (tmp_path / "new.safetensors").read_bytes()
@@ -327,7 +335,8 @@ def broken(case, tmp_path):
         return chunk_messages(file_of(tmp_path).replace(b'"seed\\":0', b'"seed\\":1'), "new", T0)
     if case == "corrupt":
         return [replace(chunks[0], data=chunks[0].data ^ 1), *chunks[1:]]
-    sizes = {"size": {"size_m": (0.3, 0.3)}, "subject": {"subject": "monitor"}}
+    turned = {"corners_in_subject": np.roll(TARGET.corners, 1, axis=0)}
+    sizes = {"size": {"size_m": (0.3, 0.3)}, "subject": {"subject": "monitor"}, "turned": turned}
     return chunk_messages(file_of(tmp_path, **sizes[case]), "new", T0)
 
 
@@ -339,6 +348,7 @@ def broken(case, tmp_path):
         ("corrupt", "with the announced hash"),
         ("size", "name the target it was made for"),
         ("subject", "was made for monitor"),
+        ("turned", "on its side: they begin 1 corner later"),
     ],
 )
 def test_what_is_wrong_with_a_new_attack_is_said_and_the_old_one_stays(case, reason, tmp_path):

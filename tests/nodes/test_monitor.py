@@ -204,6 +204,12 @@ def test_a_screen_that_changes_the_colours_ends_the_node(screen):
         ({"subject": "board"}, "for board"),
         ({"size_m": (0.4, 0.4)}, "more than the 0.336 m"),
         ({"corners_in_subject": SQUARE.corners + np.array([0.0, 0.1, 0.0])}, "10.0 cm from the middle"),
+        (
+            {"corners_in_subject": np.roll(SQUARE.corners, 1, axis=0)},
+            "on its side: they begin 1 corner later",
+        ),
+        ({"corners_in_subject": np.roll(SQUARE.corners, 2, axis=0)}, "a face upside down"),
+        ({"corners_in_subject": SQUARE.corners[[1, 0, 3, 2]]}, "got them mirrored"),
     ],
 )
 def test_an_attack_that_does_not_fit_is_refused_at_the_start(screen, changes, message):

@@ -64,6 +64,12 @@ def centre_square(target: TargetCalibration) -> TargetCalibration:
     return target.model_copy(update={"corners_in_subject_m": rows, "notes": "centre square of the panel"})
 
 
+def reordered(target: TargetCalibration, order: tuple[int, ...]) -> TargetCalibration:
+    """Make a target whose corners were given in another order."""
+    rows = tuple(target.corners_in_subject_m[index] for index in order)
+    return target.model_copy(update={"corners_in_subject_m": rows})
+
+
 def outward_normal(target: TargetCalibration) -> Array:
     """Unit vector ``[3]`` out of the face, towards a viewer in front of it, in the subject's frame."""
     normal = np.cross(target.corners[3] - target.corners[0], target.corners[1] - target.corners[0])

@@ -9,6 +9,7 @@ from typing import Any
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.errors import AdvnerfError
+from calibration.panel import MonitorPanel, require_fits, target_size
 from calibration.schema import (
     Calibration,
     CalibrationError,
@@ -118,6 +119,12 @@ def _paths(value: Any) -> Iterator[str]:
         yield value
 
 
+def _panel(target: TargetCalibration, size_mm: Any) -> MonitorPanel:
+    """A monitor's panel; its pixels say nothing about whether an attack fits."""
+    size_m = target_size(target) if size_mm is None else (size_mm[0] / 1000.0, size_mm[1] / 1000.0)
+    return MonitorPanel((1000, 1000), size_m)
+
+
 def _attack(name: str, data: dict[str, Any]) -> list[CheckResult]:
     file = Path(data["attack"])
     if not file.exists():
@@ -127,11 +134,15 @@ def _attack(name: str, data: dict[str, Any]) -> list[CheckResult]:
     except AdvnerfError as error:
         return report("attack", FAILURE, str(error), "run the attack again, or name another file")
     try:
-        if "camera" in data and "target" in data:
-            camera = load_calibration(CameraCalibration, data["camera"])
-            show(attack, camera, load_calibration(TargetCalibration, data["target"]))
+        target = load_calibration(TargetCalibration, data["target"]) if "target" in data else None
+        camera = load_calibration(CameraCalibration, data["camera"]) if "camera" in data else None
     except CalibrationError:
-        pass  # reported under "calibration"
+        target = None  # reported under "calibration"
+    try:
+        if target is not None and camera is not None:
+            show(attack, camera, target)
+        elif target is not None:
+            require_fits(attack, _panel(target, data.get("size_mm")), target)
     except AdvnerfError as error:
         return report("attack", FAILURE, f"{name}: {error}", "give the target that it was made for")
     subject = "no subject" if attack.face is None else attack.face.subject

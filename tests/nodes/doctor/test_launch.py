@@ -26,6 +26,7 @@ from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, examine
 from nodes.lab.doctor.launch import checks_of, pictures_of
 from nodes.launching.launch_file import load_launch
 from nodes.linking.keys import DRIVE, KeyFolder
+from tests.support.faces import red_attack
 from tests.support.live.processes import free_ports
 
 ROOT = Path(__file__).parents[3]
@@ -292,6 +293,22 @@ def test_a_calibration_of_the_future_is_told_and_starts(tmp_path):
     assert [row.state for row in rows] == [OK, WARNING]
     assert "vehicle.yaml is from 2999-01-01, which is still to come" in rows[1].found
     assert files.unusable(plan) == []
+
+
+@pytest.mark.parametrize(("name", "subject"), [("green_screen", "board"), ("monitor", "monitor")])
+def test_a_target_by_which_the_attack_is_shown_turned_is_told_before_the_launch(tmp_path, name, subject):
+    """The trials gave a table of it."""
+    _, file = red_attack(tmp_path, subject)
+    shutil.copytree(TWIN, tmp_path / "twin")
+    plan = plan_of(name, f"params.attack={file}", f"params.calibration={tmp_path / 'twin'}")
+    assert files.unusable(plan) == []
+    target = tmp_path / "twin" / f"{subject}.yaml"
+    document = yaml.safe_load(target.read_text())
+    corners = document["corners_in_subject_m"]
+    document["corners_in_subject_m"] = corners[2:] + corners[:2]
+    target.write_text(yaml.safe_dump(document))
+    (said,) = files.unusable(plan)
+    assert "got a face upside down: they begin 2 corners later, at the bottom right one" in said
 
 
 def _no_folder(folder):
