@@ -38,6 +38,7 @@ from nodes.runtime.process import run_node_main
 _CAR = "/vicon/car"
 _ACTIVE_S = 1.0
 _SIZE_TOLERANCE = 0.05
+_OUT_OF_VIEW, _TURNED_AWAY = "out of view", "turned away: the camera sees the back of the face"
 
 
 class CompositorConfig(StrictModel):
@@ -235,17 +236,18 @@ class CompositorNode(Node):
             return []
         T_camera_from_face = invert_transform(car.T @ self._showing.T_car_from_camera) @ face.T
         # The received array is read-only; the overlay draws on a copy.
-        image, drawn = self._showing.overlay.draw(
-            rgb_image(waiting.message, self._image_topic), T_camera_from_face
-        )
+        seen, overlay = rgb_image(waiting.message, self._image_topic), self._showing.overlay
+        image, drawn = overlay.draw(seen, T_camera_from_face)
         ahead_s = max(car.extrapolated_s, face.extrapolated_s)
         self._counts["drawn"] += drawn
         self._counts["extrapolated"] += ahead_s > 0.0
-        self._trouble = f"pose extrapolated by {1e3 * ahead_s:.0f} ms" if ahead_s > 0.0 else ""
+        if not drawn:
+            self._trouble = _TURNED_AWAY if overlay.shows_back(seen, T_camera_from_face) else _OUT_OF_VIEW
+        else:
+            self._trouble = f"pose extrapolated by {1e3 * ahead_s:.0f} ms" if ahead_s > 0.0 else ""
         frame = waiting.message.header.frame_id
         out = waiting.message if not drawn else image_message(image, waiting.stamp_ns, frame)
-        reason = self._trouble if drawn else "out of view"
-        return [Out("/compositor/image", out), self._label(waiting.message, drawn, reason)]
+        return [Out("/compositor/image", out), self._label(waiting.message, drawn, self._trouble)]
 
     def _label(self, image: Any, drawn: bool, reason: str) -> Out:
         attack_id = self._showing.attack_id if self._showing else ""

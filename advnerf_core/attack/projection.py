@@ -86,6 +86,12 @@ class FaceOverlay:
             return image, False
         return self._composite(image, corners, window)
 
+    def shows_back(self, image: Image, T_camera_from_subject: ArrayLike) -> bool:
+        """Whether the camera sees the back of the face, which is not drawn; arguments as of `draw`."""
+        behind = transform_points(T_camera_from_subject, self._corners)[[1, 0, 3, 2]]
+        window = self._window(behind) if faces_camera(behind) else None
+        return window is not None and self._composite(image, behind, window)[1]
+
     def _window(self, corners: Array) -> tuple[int, int, int, int] | None:
         """First row, end row, first column, end column that hold the face; None if it is out of view."""
         height, width = self._camera.height, self._camera.width

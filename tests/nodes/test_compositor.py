@@ -211,15 +211,23 @@ def test_two_images_never_wait(bench):
     assert [rgb_image(i, "test")[0, 0, 0] for i in bench.images()] == [10, 20]
 
 
-def test_out_of_view_passes_the_image_unchanged_and_says_so(bench):
+@pytest.mark.parametrize(
+    ("T_world_from_car", "reason"),
+    [
+        (planar_pose(0.0, 2.0, np.pi), "out of view"),
+        (planar_pose(5.0, -1.5, np.pi), "turned away: the camera sees the back of the face"),
+    ],
+)
+def test_a_face_that_is_not_drawn_passes_the_image_unchanged_and_says_why(bench, T_world_from_car, reason):
     for t in (0.0, 0.01):
         bench.send("/vicon/board", pose_message(T_WORLD_FROM_BOARD, T0 + round(t * 1e9)))
-        bench.send("/vicon/car", pose_message(planar_pose(0.0, 2.0, np.pi), T0 + round(t * 1e9)))
+        bench.send("/vicon/car", pose_message(T_world_from_car, T0 + round(t * 1e9)))
     bench.image(0.005)
     (image,), (label,) = bench.images(), bench.labels()
     assert (rgb_image(image, "test") == 90).all()
     assert not label.drawn
-    assert label.reason == "out of view"
+    assert label.reason == reason
+    assert bench.node.status() == ("active", f"attack {attack().attack_id}; {reason}")
 
 
 def test_without_an_attack_file_images_pass_at_once():

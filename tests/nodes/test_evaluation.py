@@ -5,13 +5,14 @@ from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
 from advnerf_core.geometry import planar_pose
 from nodes.bags.writer import BagWriter
-from nodes.lab.trials.evaluation import attack_ids, frames, score, timing, trajectory
+from nodes.lab.trials.evaluation import attack_ids, frames, score, timing, trajectory, why_not_shown
 from nodes.runtime.messages import drive_message, encode, header, image_message, pose_message, types
 from tests.support.messages import filled
 
 pytestmark = pytest.mark.live
 
 START_NS = 1_700_000_000_000_000_000
+REASONS = ("out of view", "turned away", "turned away")
 TICK_NS = 100_000_000
 TRACK = Path.rounded_square(4.0, 1.1)
 
@@ -35,7 +36,9 @@ def write_drive(folder, lost_frame=None, speed_mps=0.8):
         image = np.full((4, 6, 3), k, np.uint8)
         put("/camera/image_raw", image_message(image, stamp, "camera"), stamp + 10_000_000)
         put("/compositor/image", image_message(image, stamp, "camera"), stamp + 12_000_000)
-        stamped = types.AttackStamp(header=header(stamp), attack_id="abc", drawn=k > 2, reason="")
+        stamped = types.AttackStamp(
+            header=header(stamp), attack_id="abc", drawn=k > 2, reason="" if k > 2 else REASONS[k]
+        )
         put("/compositor/attack", stamped, stamp + 12_000_000)
         put("/policy/drive", drive_message(0.8, 0.1, stamp), stamp + 20_000_000)
         put("/safety/drive", drive_message(0.8, 0.1, stamp), stamp + 21_000_000)
@@ -97,3 +100,5 @@ def test_frames_and_attacks_are_those_the_policy_saw(tmp_path):
     bag = write_drive(tmp_path)
     assert [int(image[0, 0, 0]) for image in frames(bag, START_NS, 4)] == [0, 1, 2, 3]
     assert attack_ids(bag) == {"abc"}
+    assert why_not_shown(bag) == "2 of 10 labels say 'turned away'"
+    assert why_not_shown(bag, START_NS + 5 * TICK_NS) == "none of 5 labels says why"

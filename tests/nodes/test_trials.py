@@ -1,6 +1,8 @@
+import itertools
 import json
 import re
 from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,8 +20,8 @@ from nodes.bags.reader import read_attachments, read_messages
 from nodes.bags.writer import BagWriter
 from nodes.cli.main import app
 from nodes.lab.trials.bags import evaluate_bag, find_drives
-from nodes.lab.trials.plan import CampaignError, finished, make_order, williams_rows
-from nodes.lab.trials.series import drive_series, prepare_series, summarise
+from nodes.lab.trials.plan import CampaignError, PlannedDrive, finished, make_order, williams_rows
+from nodes.lab.trials.series import drive_series, prepare_series, require_shown, summarise
 from nodes.launching.launch import Launch
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, ConfigError
@@ -391,6 +393,28 @@ def test_each_drive_of_a_bag_has_the_attacks_that_were_shown_in_it(tmp_path, top
         labels += [label(third[0] - half_s, "bbbb", True)]
     shown = copied(bag, tmp_path / "shown", more=labels)
     assert [drive["attack_ids"] for drive in evaluate_bag(shown, None, ticks=20)] == [["aaaa"], [], ["bbbb"]]
+
+
+def test_a_drive_without_its_attack_is_refused_with_the_reason_of_most_labels(tmp_path):
+    """Those from before the drive, while the car was not armed, say nothing about it."""
+    bag = write_bag(tmp_path, [(1.0, 2.2, "disarmed by trial: trial is over")])
+    (span,) = find_drives(bag)
+    reasons = ["not armed"] * 40 + ["out of view"] * 5 + ["turned away"] * 15
+    first_ns = span.start_real_ns - 40 * NS_PER_S // 10
+    labels = [
+        (
+            "/compositor/attack",
+            types.AttackStamp(header=header(at), attack_id="aaaa", drawn=False, reason=reason),
+            at,
+        )
+        for at, reason in zip(itertools.count(first_ns, NS_PER_S // 10), reasons, strict=False)
+    ]
+    labelled = copied(bag, tmp_path / "labelled", more=labels)
+    (found,) = evaluate_bag(labelled, None, ticks=20)
+    run = PlannedDrive(1, "g", 0, "a.safetensors", "aaaa")
+    with pytest.raises(CampaignError, match=r"got \[\]: 15 of 20 labels say 'turned away'; check compositor"):
+        require_shown(run, found, labelled)
+    require_shown(replace(run, attack_id=""), found, labelled)
 
 
 def test_a_car_that_is_carried_away_after_its_drive_stopped_costs_no_drive(tmp_path):

@@ -22,7 +22,7 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive
 from nodes.experiment.show.faces import on_screen, panel_of, wanted_face
 from nodes.experiment.show.given import given_in, victim_sha256, victim_spec
-from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
+from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory, why_not_shown
 from nodes.lab.trials.trial import TrialOutcome, TrialPlan
 from nodes.lab.trials.trial_runner import TrialNodes
 from nodes.lab.trials.tries import NotDrivenError, drive_with_tries
@@ -179,7 +179,7 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path, nodes: LiveN
     last_frame_ns = outcome.end_real_ns - round(horizon.dt_s * NS_PER_S)
     times = timing(bag, outcome.start_real_ns, last_frame_ns)
     drawn = sorted(attack_ids(bag))
-    _check_drawn(live, drawn)
+    _check_drawn(live, bag, drawn)
     result: dict[str, Any] = {
         "victim": live.victim,
         "attack_ids": drawn,
@@ -265,7 +265,9 @@ def _horizon(experiment: Experiment, live: LiveRun) -> Horizon:
     return limits if live.ticks is None else replace(limits, ticks=live.ticks)
 
 
-def _check_drawn(live: LiveRun, drawn: list[str]) -> None:
+def _check_drawn(live: LiveRun, bag: Path, drawn: list[str]) -> None:
     expected = [load_attack(live.attack).attack_id] if live.attack is not None else []
     if drawn != expected:
-        raise RuntimeFault(f"expected the attacks {expected} in the frames of run {live.name}, got {drawn}")
+        raise RuntimeFault(
+            f"expected the attacks {expected} in the frames of run {live.name}, got {drawn}: {why_not_shown(bag)}"
+        )

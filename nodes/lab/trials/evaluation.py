@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -164,6 +165,23 @@ def attack_ids(
             if drawn and at < end_real_ns and end >= start_real_ns
         }
     return found
+
+
+def why_not_shown(bag: Path, start_real_ns: int = 0, end_real_ns: int = 2**63) -> str:
+    """The reason that most labels without an attack give, between two times [ns, CLOCK_REALTIME], and how many of all labels give it."""
+    present = {topic.name for topic in read_info(bag).topics}
+    labels = [
+        label
+        for name in SHOWN_BY
+        if name in present
+        for label in read_decoded(bag, name)
+        if start_real_ns <= ns_from_stamp(label.header.stamp) < end_real_ns
+    ]
+    reasons = Counter(str(label.reason) for label in labels if not label.drawn)
+    if not reasons:
+        return f"none of {len(labels)} labels says why"
+    reason, count = reasons.most_common(1)[0]
+    return f"{count} of {len(labels)} labels say {reason!r}"
 
 
 def counterfactual(bag: Path, start_real_ns: int, end_real_ns: int) -> Counterfactual | None:

@@ -16,7 +16,8 @@ import numpy as np
 from advnerf_core.files import sha256_of
 from advnerf_core.policies.load import policy_file_sha256
 from calibration.schema import RoomCalibration, load_calibration
-from nodes.lab.trials.bags import measure_drives
+from nodes.lab.trials.bags import find_drives, measure_drives
+from nodes.lab.trials.evaluation import why_not_shown
 from nodes.lab.trials.plan import (
     NONE,
     CampaignError,
@@ -147,12 +148,26 @@ def _drive_once(
     found = measure_drives(run_dir / "bag", series.room, plan.ticks)[-1]
     if not found["counts"]:
         raise SpoiledError(found["stopped_early"])
+    require_shown(run, found, run_dir / "bag")
+    return {"condition": run.condition, "repeat": run.repeat, "peer": outcome.peer, **found}
+
+
+def require_shown(run: PlannedDrive, found: dict[str, Any], bag: Path) -> None:
+    """Raise unless exactly the attack of a run was shown in the last drive of its bag; the error quotes the labels.
+
+    Args:
+        found: That drive, as `measure_drives` evaluates it.
+
+    Raises:
+        CampaignError: No attack or another one was shown.
+    """
     wanted = [run.attack_id] if run.attack_id else []
     if found["attack_ids"] != wanted:
+        span = find_drives(bag)[-1]
+        why = why_not_shown(bag, span.start_real_ns, span.end_real_ns)
         raise CampaignError(
-            f"expected the attacks {wanted} to be shown in run {run.name}, got {found['attack_ids']}; check compositor or monitor"
+            f"expected the attacks {wanted} to be shown in run {run.name}, got {found['attack_ids']}: {why}; check compositor or monitor"
         )
-    return {"condition": run.condition, "repeat": run.repeat, "peer": outcome.peer, **found}
 
 
 def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

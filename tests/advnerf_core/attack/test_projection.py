@@ -82,14 +82,19 @@ def test_rows_go_down_and_columns_go_right_for_the_viewer():
 
 def test_turned_away_behind_and_out_of_view_leave_the_image_alone():
     overlay = FaceOverlay(face_texture(theta()), CORNERS, CAMERA)
-    for camera in (
-        look_at([-2.0, 0, 0.1], [0, 0, 0]),
-        look_at([2.0, 0, 0.1], [4, 0, 0]),
-        look_at([2.0, 0, 0.1], [2, 3, 0]),
+    for camera, back in (
+        (look_at([-2.0, 0, 0.1], [0, 0, 0]), True),
+        (look_at([-2.0, 0, 0.1], [-2, 3, 0]), False),
+        (look_at([-2.0, 0, 0.1], [-4, 0, 0]), False),
+        (look_at([2.0, 0, 0.1], [4, 0, 0]), False),
+        (look_at([2.0, 0, 0.1], [2, 3, 0]), False),
+        (look_at([0.0, 2.0, 0.0], [0, 0, 0]), False),  # edge-on
     ):
         image, drawn = overlay.draw(GREY, invert_transform(camera))
         assert not drawn
         assert image is GREY
+        assert overlay.shows_back(GREY, invert_transform(camera)) is back
+    assert not overlay.shows_back(GREY, invert_transform(look_at([2.0, 0, 0.1], [0, 0, 0])))
 
 
 def test_a_face_through_the_camera_plane_is_clipped():
