@@ -91,6 +91,7 @@ class CalibrationDrive(Node):
 
     subscriptions = (IMAGE, STATE)
     publications = (DRIVE,)
+    blind = True
 
     def __init__(self, parts: Sequence[Manoeuvre]) -> None:
         self._parts = parts

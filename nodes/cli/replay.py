@@ -105,7 +105,8 @@ def _choice(nodes: str, replace: list[str], launch: Path | None, policy: str, ov
             raise BagError(
                 f"expected the node policy among --nodes, because --policy is given; got {', '.join(names) or 'none'}. Add it"
             )
-        # The recorded hash belongs to the recorded policy.
+        # The recorded node may be one that knows no policies; the recorded hash belongs to the recorded policy.
+        replacements.setdefault("policy", "nodes.policy")
         overrides = [f"policy.policy={json.dumps(policy)}", 'policy.sha256=""', *overrides]
     return Choice(names, replacements, launch, tuple(overrides))
 

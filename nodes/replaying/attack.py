@@ -140,7 +140,8 @@ def retro_attack(bag: Path, attack: Path, choice: Choice) -> RetroAttack:
         choice: Nodes to run. ``compositor`` gets the attack; overrides select the policy.
 
     Raises:
-        BagError: The compositor or a policy is not among the nodes, or no image got a command.
+        BagError: The compositor or a policy is not among the nodes, a node commands without looking at images, or no
+            image got a command.
     """
     if _COMPOSITOR not in choice.nodes:
         raise BagError(
@@ -210,6 +211,10 @@ def _steering(
         if _DRIVE not in replay.made_topics:
             raise BagError(
                 f"expected a policy, which publishes {_DRIVE}, among --nodes, got {', '.join(replay.names)}; add it"
+            )
+        if blind := replay.blind_sources(_DRIVE):
+            raise BagError(
+                f"expected a policy that looks at images, got {', '.join(blind)}, whose commands no attack can change; name a policy with --policy"
             )
         for made in replay:
             if made.topic not in (_DRIVE, _LABEL):

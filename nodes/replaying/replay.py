@@ -71,6 +71,10 @@ class Replay:
         """Names of the replayed nodes."""
         return list(self._nodes)
 
+    def blind_sources(self, topic: str) -> list[str]:
+        """Names of the replayed nodes that publish a topic and do not look at the images that they get."""
+        return [name for name, node in self._nodes.items() if node.blind and topic in node.publications]
+
     @property
     def made_topics(self) -> set[str]:
         """Topics whose recorded messages are replaced by the replayed nodes' messages."""

@@ -59,6 +59,7 @@ class Node:
         inbox: Queue for data from driver threads. Its items are passed to `receive` at once.
         raw: Do not decode messages: `handle` gets None as message, and the bytes in ``info.raw``.
         queues: Queue length by topic, for topics whose every message the node needs. It overrides the topic table.
+        blind: The node takes only the stamps of the images that it gets, so that no attack can change what it commands.
         opens: What the node opens besides the files that it reads, for example a device. Only a node that opens nothing can be replayed.
     """
 
@@ -68,6 +69,7 @@ class Node:
     inbox: Inbox[Any] | None = None
     raw: bool = False
     queues: Mapping[str, int] = {}
+    blind: bool = False
     opens: str = ""
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 
 from nodes.bags.info import BagMessage
 from nodes.bags.reader import read_attachments, read_info, read_messages
@@ -105,6 +106,54 @@ def test_retro_attack_on_the_command_line(clean_drive, tmp_path, capsys):
     assert "with the face in view (12 of 12 images) the policy would have steered" in printed
     assert "clean against recorded: 0.000 degrees" in printed
     assert printed.count("in view") == 13
+
+
+GREEN_TO_THE_LEFT = """
+from advnerf_core import PolicyContract, PolicyView, adapt
+from advnerf_core.geometry import Pinhole
+
+def factory():
+    view = PolicyView(Pinhole(48, 27, 24.0, 24.0, 24.0, 13.5), crop_top_px=0, crop_height_px=27, width=48, height=27)
+    return adapt(lambda images: images[:, 1, :, 24:].mean((1, 2)) - images[:, 1, :, :24].mean((1, 2)), PolicyContract(view))
+"""
+
+
+@pytest.mark.parametrize("module", ["nodes.policy", "nodes.calibration_drive", "nodes.expert", "antigravity"])
+def test_a_given_policy_drives_the_replay_of_any_recorded_node(
+    clean_drive, tmp_path, capsys, monkeypatch, module
+):
+    (tmp_path / "green_to_the_left.py").write_text(GREEN_TO_THE_LEFT)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    attack = tmp_path / "new.attack.safetensors"
+    attack.write_bytes(read_attachments(CORNER)["corner.attack.safetensors"])
+    bag = recorded_with(clean_drive, tmp_path / "bag", module)
+    command = ["bag", "replay", str(bag), "--policy", "green_to_the_left:factory"]
+    cli.app([*command, "--attack", str(attack), "--json", str(tmp_path / "r.json")], standalone_mode=False)
+    numbers = json.loads((tmp_path / "r.json").read_text())
+    assert numbers["frames_drawn"] == 12
+    assert abs(numbers["mean_delta_drawn_rad"]) > 0.001
+    cli.app([*command, "--nodes", "compositor,policy"], standalone_mode=False)
+    assert "12 /policy/drive" in capsys.readouterr().out
+
+
+def test_an_attack_on_a_node_that_looks_at_nothing_is_refused(clean_drive, tmp_path):
+    attack = tmp_path / "new.attack.safetensors"
+    attack.write_bytes(read_attachments(CORNER)["corner.attack.safetensors"])
+    bag = recorded_with(clean_drive, tmp_path / "bag", "nodes.calibration_drive")
+    with pytest.raises(BagError, match=r"a policy that looks at images, got policy, .* with --policy"):
+        retro_attack(bag, attack, Choice(GREEN.nodes))
+
+
+def recorded_with(drive, copy, module):
+    """A copy of a drive whose launch file names another module for the node policy, with keys of its own."""
+    launch = yaml.safe_load(read_attachments(drive)["launch.resolved.yaml"])
+    own = {"nodes.calibration_drive": {"slow_mps": 0.5}, "nodes.expert": {"room": "r.yaml"}}
+    launch["nodes"]["policy"] = {"module": module, "config": own.get(module, {})}
+    attachments = {**read_attachments(drive), "launch.resolved.yaml": yaml.safe_dump(launch).encode()}
+    with BagWriter(copy, attachments, read_info(drive).metadata) as writer:
+        for m in read_messages(drive):
+            writer.write(m.topic, m.cdr, m.log_ns, m.publish_ns, m.sequence)
+    return copy
 
 
 @pytest.mark.parametrize(
