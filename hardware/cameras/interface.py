@@ -23,12 +23,14 @@ class Frame:
         stamp_realtime_ns: Capture time in real time, as close to the exposure as the device can report [ns].
         stamp_mono_ns: The same time on the monotonic clock [ns].
         sequence: Frame number of the device. A gap means frames that were not delivered.
+        simulated: It is an image of the simulated lab, where a car that stands sees the same pixels again: no sign of a frozen camera.
     """
 
     rgb: NDArray[np.uint8]
     stamp_realtime_ns: int
     stamp_mono_ns: int
     sequence: int
+    simulated: bool = False
 
 
 class Camera(Protocol):

@@ -20,7 +20,8 @@ class Source(StrictModel, ABC):
 
     Attributes:
         stall_s: Time without a frame after which the device is reopened [s].
-        repeats: Number of identical images in a row after which the device is reopened; each is withheld. 0 for never.
+        repeats: Number of identical images in a row after which the device is reopened; each is withheld. 0 for never. Images of
+            the simulated lab do not count.
     """
 
     stall_s: float = Field(default=1.0, gt=0.0)

@@ -73,7 +73,6 @@ class SocketSource(Source):
     """
 
     kind: Literal["socket"] = "socket"
-    repeats: int = Field(default=0, ge=0)  # a simulated car that stands sees one image
     path: Path
 
     def camera(self) -> SocketCamera:

@@ -16,8 +16,8 @@ class SteadyCamera:
     Args:
         stall_s: Time without a frame after which it is reopened [s].
         first_frame_s: The same time for the first frame after opening [s].
-        repeats: Number of identical images in a row that count as a stall; 0 for never. Sensor noise makes real images differ, so that each
-            is withheld: the car must not steer by it for as long as it takes to count them.
+        repeats: Number of identical images in a row that count as a stall, but for simulated ones; 0 for never. Sensor noise makes real images
+            differ, so that each is withheld: the car must not steer by it for as long as it takes to count them.
         pauses_s: First and longest pause before another attempt, doubled each time [s].
 
     Attributes:
@@ -90,7 +90,8 @@ class SteadyCamera:
             raise HardwareError(f"the camera is connected but gave no frame for {waited_s:g} s; reopening it")
 
     def _watch_repeats(self, frame: Frame) -> None:
-        if self._repeats == 0:
+        if self._repeats == 0 or frame.simulated:
+            self._same = 0
             return
         digest = zlib.crc32(frame.rgb.data)
         self._same = self._same + 1 if digest == self._digest else 0

@@ -251,7 +251,7 @@ class LiveLab:
                 last_ns = tick_ns
                 self._hold_until(tick_ns + round(self.config.camera_latency_s * NS_PER_S))
                 if rgb is not None:  # else lost on the way: its number is missing
-                    self._frames.publish(Frame(rgb, real_ns, tick_ns, sequence))
+                    self._frames.publish(Frame(rgb, real_ns, tick_ns, sequence, simulated=True))
                 sequence += 1
 
     def _hold_until(self, mono_ns: int) -> None:

@@ -3,6 +3,8 @@
 import socket
 import threading
 import time
+from contextlib import closing
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ from hardware.cameras.file import FileCamera
 from hardware.cameras.frame_wire import HEAD_BYTES, decode_frame, encode_head
 from hardware.cameras.interface import Frame
 from hardware.cameras.socket import SocketCamera
+from hardware.cameras.sources import SocketSource
 from hardware.emulators.frame_server import FrameServer
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost, LinkTimeout, ProtocolError
 from tests.support.sockets import connected
@@ -46,6 +49,21 @@ def test_frames_come_through_with_their_stamps(tmp_path):
             assert (got.sequence, got.stamp_realtime_ns) == (sequence, 10**18 + sequence)
             np.testing.assert_array_equal(got.rgb, frame(sequence).rgb)
             assert not got.rgb.flags.writeable
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_frozen_camera_behind_a_socket_is_noticed_and_a_simulated_car_may_stand(tmp_path, simulated):
+    """Your own server gives one picture with new stamps; the simulated lab does so while its car stands."""
+    camera = SocketSource(path=tmp_path / "frames").steady()
+    with FrameServer(tmp_path / "frames") as server, closing(camera):
+        assert camera.read(timeout_s=0.02) is None  # opens it
+        wait_for(lambda: server.clients == 1, "the client")
+        got = []
+        for sequence in range(16):
+            server.publish(replace(frame(sequence), rgb=frame(0).rgb, simulated=simulated))
+            got.append(camera.read(timeout_s=60.0))
+        assert [each is not None for each in got] == [True] + 15 * [simulated]
+        assert camera.error == "" if simulated else "repeats one image (16 identical" in camera.error
 
 
 @pytest.mark.parametrize("gave_up_before", [False, True])

@@ -93,6 +93,7 @@ def test_frames_come_at_their_rate_with_true_stamps(lab):
     assert (np.round(periods) >= 1).all()
     assert 0 < arrived_ns - stamps[-1] < 300e6
     assert frames[0].rgb.shape == (188, 336, 3)
+    assert all(f.simulated for f in frames)  # a car that stands sees one image
     with Lab(lab.config.lab) as still:
         expected, _ = still.observe_at(-1.1, -2.0, 0.0, depth=False)
     assert cv2.PSNR(frames[-1].rgb, expected) > 40.0
