@@ -1,8 +1,9 @@
 """The calibration drive for ``advnerf car calibrate vehicle``. It replaces the policy: ``--set policy.module=nodes.calibration_drive``.
 
-The car drives circles to both sides, straight runs and wide curves at two speeds, then steps of steering and speed. This takes about
-45 s and 6 x 5.5 m, with 3.5 m behind the start and 3.2 m to its right. The car drives only while the safety node has armed it,
-within fence and limits like any policy. After a stop, the interrupted part starts again; the operator may carry the car back first.
+The car drives circles to both sides, straight runs and wide curves at two speeds, then steps of steering and speed. This takes up to
+a minute. With a wheelbase of up to 0.35 m and a steering gain that is right to 10 %, the car stays within 6.5 m behind its start, 3.5 m
+in front, 4 m to its right and 4.5 m to its left. The car drives only while the safety node has armed it, within fence and limits like
+any policy. After a stop, the interrupted part starts again; the operator may carry the car back first.
 """
 
 from __future__ import annotations
@@ -10,17 +11,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from advnerf_core.strict import StrictModel
+from calibration.schema import VehicleCalibration, load_calibration
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import drive_message, stamp_ns
 from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
 
-IMAGE, STATE, DRIVE = "/compositor/image", "/safety/state", "/policy/drive"
+STATE, DRIVE = "/safety/state", "/policy/drive"
+# Keys of the policy node that a launch file may give, and that say nothing about this drive.
+UNREAD_KEYS = ("policy", "sha256", "planned_speed", "max_age_s", "recorded", "goal")
 STRAIGHT_SLOW_S, STRAIGHT_FAST_S = 1.8, 1.4
 STEPS = 6
 
@@ -39,23 +44,30 @@ class Manoeuvre:
 
 
 class CalibrationDriveConfig(StrictModel):
-    """Configuration of the calibration drive. Other keys of the policy node are ignored, so that this node can replace it.
+    """Configuration of the calibration drive. `UNREAD_KEYS` are ignored, so that this node can replace the policy node.
 
     Attributes:
+        vehicle: Vehicle calibration file, whose wheelbase gives the length of a half circle.
+        image_topic: Topic of the images, raw or compressed; each is answered with a command.
         slow_mps: The lower speed [m/s].
         fast_mps: The higher speed [m/s].
+        speed_mps: Highest speed; if it is below ``fast_mps``, both speeds are lowered in proportion [m/s]. None for no other limit.
         tight_rad: Wheel angle of the circles [rad].
         wide_rad: Wheel angle of the wide curves [rad].
-        wheelbase_m: Distance between the axles, for the length of a half circle [m].
     """
 
-    model_config = ConfigDict(extra="ignore")
-
+    vehicle: Path
+    image_topic: str = "/compositor/image"
     slow_mps: float = Field(default=0.5, gt=0.0)
     fast_mps: float = Field(default=0.9, gt=0.0)
+    speed_mps: float | None = Field(default=None, gt=0.0)
     tight_rad: float = Field(default=0.25, gt=0.05, lt=0.6)
     wide_rad: float = Field(default=0.12, gt=0.02, lt=0.6)
-    wheelbase_m: float = Field(default=0.25, gt=0.0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_the_policy(cls, data: Any) -> Any:
+        return {key: data[key] for key in data if key not in UNREAD_KEYS} if isinstance(data, dict) else data
 
     @model_validator(mode="after")
     def _apart(self) -> CalibrationDriveConfig:
@@ -66,12 +78,18 @@ class CalibrationDriveConfig(StrictModel):
         return self
 
 
-def program(config: CalibrationDriveConfig) -> list[Manoeuvre]:
-    """Parts of the drive: a loop to the left, a faster loop to the right, then two rows of steps with half circles between them."""
-    slow, fast, tight, wide = config.slow_mps, config.fast_mps, config.tight_rad, config.wide_rad
+def program(config: CalibrationDriveConfig, wheelbase_m: float) -> list[Manoeuvre]:
+    """Parts of the drive: a loop to the left, a faster loop to the right, then two rows of steps with half circles between them.
+
+    Args:
+        wheelbase_m: Distance between the axles [m].
+    """
+    share = min(1.0, (config.speed_mps or config.fast_mps) / config.fast_mps)
+    slow, fast = share * config.slow_mps, share * config.fast_mps
+    tight, wide = config.tight_rad, config.wide_rad
 
     def half_circle(steering: float, speed: float) -> Manoeuvre:
-        return Manoeuvre(math.pi * config.wheelbase_m / math.tan(abs(steering)) / speed, steering, speed)
+        return Manoeuvre(math.pi * wheelbase_m / math.tan(abs(steering)) / speed, steering, speed)
 
     parts = []
     for speed, hold_s, turn in ((slow, STRAIGHT_SLOW_S, tight), (fast, STRAIGHT_FAST_S, -tight)):
@@ -89,19 +107,24 @@ def program(config: CalibrationDriveConfig) -> list[Manoeuvre]:
 class CalibrationDrive(Node):
     """Answers every image with the current command of the drive."""
 
-    subscriptions = (IMAGE, STATE)
     publications = (DRIVE,)
     blind = True
 
-    def __init__(self, parts: Sequence[Manoeuvre]) -> None:
+    def __init__(self, parts: Sequence[Manoeuvre], image_topic: str = "/compositor/image") -> None:
+        self.subscriptions = (image_topic, STATE)
         self._parts = parts
         self._index, self._since_ns = 0, 0
         self._armed = False
 
     @classmethod
     def build(cls, config: CalibrationDriveConfig, context: NodeContext) -> CalibrationDrive:
-        """Build the node."""
-        return cls(program(config))
+        """Build the node.
+
+        Raises:
+            calibration.schema.CalibrationError: There is no such vehicle file, or it is wrong.
+        """
+        car = load_calibration(VehicleCalibration, config.vehicle)
+        return cls(program(config, car.wheelbase_m), config.image_topic)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Note the state of the safety node, or answer an image."""

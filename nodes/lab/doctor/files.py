@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from calibration.schema import (
     VehicleCalibration,
     load_calibration,
 )
+from nodes.calibration_drive import UNREAD_KEYS
 from nodes.compositor import show
 from nodes.lab.doctor.check import FAILURE, OK, WARNING, CheckResult, report
 from nodes.launching.launch_file import Plan
@@ -30,6 +31,8 @@ _COMMON: dict[str, type[Calibration]] = {
 }  # fmt: skip
 # The key "calibration" means the calibration of the node's own device.
 _OWN: dict[str, type[Calibration]] = {"nodes.camera": CameraCalibration, "nodes.motor": VehicleCalibration}
+# Keys that a node does not read, by its module.
+_UNREAD = {"nodes.calibration_drive": UNREAD_KEYS}
 _FILES = (".safetensors", ".onnx", ".pt2", ".conf", ".yaml", ".mcap", ".db3", ".bag")
 
 
@@ -87,8 +90,8 @@ def _absent(plan: Plan) -> list[CheckResult]:
     known = {str(file) for file, _ in _calibration_files(plan)}
     return [
         CheckResult("files", FAILURE, f"{name}: no file {value}", _PATH_CURE)
-        for name in plan.nodes
-        for value in _paths(plan.documents[name].data)
+        for name, entry in plan.nodes.items()
+        for value in _paths(plan.documents[name].data, _UNREAD.get(entry.module, ()))
         if value not in known and not Path(value).exists()
     ]
 
@@ -107,10 +110,10 @@ def _line(row: CheckResult) -> str:
     return " ".join(f"{row.found}; {row.do}".split())
 
 
-def _paths(value: Any) -> Iterator[str]:
+def _paths(value: Any, unread: Sequence[str] = ()) -> Iterator[str]:
     if isinstance(value, dict):
         for key, item in value.items():
-            if key != "attack" or not isinstance(item, str):  # see _attack
+            if key not in unread and (key != "attack" or not isinstance(item, str)):  # see _attack
                 yield from _paths(item)
     elif isinstance(value, list):
         for item in value:

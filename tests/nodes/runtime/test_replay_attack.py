@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -108,6 +109,7 @@ def test_retro_attack_on_the_command_line(clean_drive, tmp_path, capsys):
     assert printed.count("in view") == 13
 
 
+VEHICLE = Path(__file__).parents[3] / "calibration/twin/vehicle.yaml"
 GREEN_TO_THE_LEFT = """
 from advnerf_core import PolicyContract, PolicyView, adapt
 from advnerf_core.geometry import Pinhole
@@ -147,7 +149,7 @@ def test_an_attack_on_a_node_that_looks_at_nothing_is_refused(clean_drive, tmp_p
 def recorded_with(drive, copy, module):
     """A copy of a drive whose launch file names another module for the node policy, with keys of its own."""
     launch = yaml.safe_load(read_attachments(drive)["launch.resolved.yaml"])
-    own = {"nodes.calibration_drive": {"slow_mps": 0.5}, "nodes.expert": {"room": "r.yaml"}}
+    own = {"nodes.calibration_drive": {"vehicle": str(VEHICLE)}, "nodes.expert": {"room": "r.yaml"}}
     launch["nodes"]["policy"] = {"module": module, "config": own.get(module, {})}
     attachments = {**read_attachments(drive), "launch.resolved.yaml": yaml.safe_dump(launch).encode()}
     with BagWriter(copy, attachments, read_info(drive).metadata) as writer:
