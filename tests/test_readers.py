@@ -54,7 +54,6 @@ HEADERS = {  # text in the header of a tensor file or archive that our own write
 OWN = {  # text that the same function has just written, or already read as a whole
     "advnerf_core/learning/retrain.py": 1,
     "advnerf_core/report/evidence/verifying/numbers.py": 1,
-    "benchmarks/retraining.py": 1,
     "nodes/experiment/run/published.py": 1,
     "nodes/experiment/show/experiment_world.py": 1,
     "nodes/experiment/engine/artefact.py": 1,
