@@ -60,6 +60,11 @@ class ImageSet:
             if plane is not None and plane.shape != self.rgb.shape[:3]:
                 raise ValueError(f"expected {name} of shape {self.rgb.shape[:3]}, got {plane.shape}")
 
+    @property
+    def transparent(self) -> bool:
+        """Whether any pixel is not wholly opaque. Pictures of a place may have an alpha channel that says nothing."""
+        return self.alpha is not None and bool((self.alpha < OPAQUE).any())
+
     def on_background(self, colour: ArrayLike) -> Rgb:
         """The images over one colour ``[3]`` in 0..1, ``[N, H, W, 3]`` uint8."""
         if self.alpha is None:

@@ -23,7 +23,7 @@ class LearningCheck:
 
     def __init__(self, images: ImageSet) -> None:
         self._one_colour_db = one_colour_db(images.rgb)
-        self._done = images.alpha is not None or self._one_colour_db > _PLAIN_DB
+        self._done = images.transparent or self._one_colour_db > _PLAIN_DB
 
     def __call__(self, at: TrainingReport) -> str | None:
         """A sentence about the problem, at the first report after 100 steps; None if there is no problem."""
@@ -39,13 +39,13 @@ class LearningCheck:
 
 
 def held_out_problem(psnr_db: float, images: ImageSet) -> str | None:
-    """A sentence if a finished scene shows held-out pictures hardly better than one colour; None otherwise, and for pictures with alpha.
+    """A sentence if a finished scene shows held-out pictures hardly better than one colour; None otherwise, and for transparent pictures.
 
     Args:
         psnr_db: Mean PSNR of the pictures [dB].
         images: The pictures.
     """
-    if images.alpha is not None or beats_one_colour(psnr_db, images.rgb):
+    if images.transparent or beats_one_colour(psnr_db, images.rgb):
         return None
     plain_db = one_colour_db(images.rgb)
     reached = f"held-out pictures reach {psnr_db:.1f} dB, one colour for all gives {plain_db:.1f} dB"

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.data.epipolar import require_agreeing_poses
-from advnerf_core.data.image_files import OPAQUE
 from advnerf_core.data.transforms import load_transforms
 from advnerf_core.data.views import ImageSet, PosedImages
 from advnerf_core.fields.hash_grid import HashGridConfig
@@ -44,6 +43,7 @@ SCENE, CHECKPOINT, FIGURES, EXPOSURE = (
 MM_PER_M = 1000.0
 _NO_TIME_LIMIT_STEPS = 1_000_000
 _WHITE = (1.0, 1.0, 1.0)
+_SURFACE = 0.5  # opacity of a pixel that shows one
 _NAMED = 3  # cameras in a warning
 _BLACK = 4  # of 255: noise of sensors and JPEG in a picture without light
 _MEASURES = ("psnr_db", "gain_fitted_psnr_db", "ssim")
@@ -172,6 +172,7 @@ def render(
         )
     _warn_of_cameras_outside(renderer, listed)
     frames: list[NDArray[np.uint8]] = []
+    surfaces = lost = 0
     for index, (camera, pinhole) in enumerate(zip(listed.frames, pinholes, strict=True)):
         rgb, depth_m, alpha = renderer.render(camera.T_world_from_camera[None], pinhole)
         picture = np.rint(255 * rgb[0].numpy()).astype(np.uint8)
@@ -180,11 +181,21 @@ def render(
             _write_png(file, picture[..., ::-1])
         else:
             _write_png(file, _with_alpha(rgb[0].numpy(), alpha[0].numpy()))
-        _write_png(file.with_name(f"{file.stem}_depth_mm.png"), depth_in_mm(depth_m[0].numpy()))
+        depth_mm = depth_in_mm(depth_m[0].numpy())
+        _write_png(file.with_name(f"{file.stem}_depth_mm.png"), depth_mm)
+        surface = alpha[0].numpy() >= _SURFACE
+        surfaces += int(surface.sum())
+        lost += int((surface & (depth_mm == 0)).sum())
         frames.append(picture)
         report((index + 1) / len(pinholes), file.stem)
     if video is not None:
         write_video(video, frames)
+    if lost:
+        print(
+            f"warning: {max(1, round(100 * lost / surfaces))} % of the pixels of surfaces are 0 in the depth pictures, which hold millimetres up to 65.5 m; "
+            "are the poses of the photographs in metres?",
+            flush=True,
+        )
     return len(frames)
 
 
@@ -227,7 +238,7 @@ def scene_field(
         ConfigError: The scene should be bounded, and no box contains its cameras.
     """
     aabb_scale = listed.aabb_scale or 1.0
-    transparent = images is not None and _transparent(images)
+    transparent = images is not None and images.transparent
     low, high, unbounded = _box(request, listed, images if transparent else None)
     if request.preset == "instant-ngp":
         # Müller et al. 2022, table 1 and section 5.4, and the sizes of its configs/nerf/base.json.
@@ -333,10 +344,6 @@ def _short(corner: ArrayLike) -> list[float]:
 def _corner(corner: Array) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in corner)
     return x, y, z
-
-
-def _transparent(images: ImageSet) -> bool:
-    return images.alpha is not None and bool((images.alpha < OPAQUE).any())
 
 
 def _with_alpha(over_white: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:

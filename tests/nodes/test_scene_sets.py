@@ -50,6 +50,19 @@ def stereo(scene: Path, file: Path) -> Path:
     return write_frames(scene, file, poses, names=names)
 
 
+@pytest.mark.parametrize("half", [1.0, 100.0])
+def test_depth_that_no_picture_can_hold_is_told(command: Command, tmp_path: Path, half: float) -> None:
+    """Depth pictures are in millimetres; those of a scene in millimetres were black, without a word."""
+    scene = write_scene(tmp_path / "scene.safetensors", half=half)
+    outside = [look_at([3.0 * half, 0.1 * half, 0.1 * half], [0.0, 0.0, 0.0])]
+    write_frames(scene, tmp_path / "transforms.json", outside)
+    code, said, _ = command("render", scene, tmp_path, "-o", tmp_path / "views")
+    assert code == 0
+    depth_mm = cv2.imread(str(tmp_path / "views" / "0000_0_depth_mm.png"), cv2.IMREAD_UNCHANGED)
+    assert bool(depth_mm.any()) is (half == 1.0)
+    assert ("100 % of the pixels of surfaces are 0 in the depth pictures" in said) is (half == 100.0)
+
+
 def test_both_images_of_a_stereo_camera_are_shown(scene: Path, tmp_path: Path) -> None:
     view = SceneView(scene, stereo(scene, tmp_path / "transforms.json"), port=18090)
     try:

@@ -18,10 +18,10 @@ CAMERA = Pinhole(40, 30, 30.0, 30.0, 20.0, 15.0)
 INSIDE = [look_at([0.3 * np.cos(a), 0.3 * np.sin(a), 0.1], [0.0, 0.0, 0.0]) for a in np.linspace(0.0, 5.0, 5)]
 
 
-def write_scene(path: Path, full: bool = True) -> Path:
-    """A box of 2 m, full of matter or empty."""
+def write_scene(path: Path, full: bool = True, half: float = 1.0) -> Path:
+    """A box of 2 m, or of twice ``half``, full of matter or empty."""
     grid = HashGridConfig(levels=4, features=2, log2_entries=10, coarsest=4, finest=16)
-    field = SceneField(SceneFieldConfig((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), grid=grid, hidden=8, features=7))
+    field = SceneField(SceneFieldConfig((-half,) * 3, (half,) * 3, grid=grid, hidden=8, features=7))
     with torch.no_grad():
         field.grid.table.normal_(std=0.8, generator=torch.Generator().manual_seed(0))
         field.density_2.bias[0] = 6.0

@@ -124,6 +124,20 @@ def test_what_one_colour_reaches_follows_from_the_spread_of_colours():
     assert LearningCheck(images)(dataclasses.replace(at, psnr_db=9.0)) is None
 
 
+def test_an_alpha_channel_that_is_opaque_everywhere_switches_no_check_off():
+    rgb = np.zeros((1, 10, 10, 3), np.uint8)
+    rgb[:, :5] = 255
+    alpha = np.full((1, 10, 10), 255, np.uint8)
+    at = TrainingReport(100, 0.5, 6.5, 1.0)
+    opaque = ImageSet(rgb, (LENS,), np.eye(4)[None], alpha)
+    assert LearningCheck(opaque)(at) is not None
+    assert held_out_problem(6.5, opaque) is not None
+    alpha[0, 0, 0] = 254
+    cut_out = dataclasses.replace(opaque, alpha=alpha)
+    assert LearningCheck(cut_out)(at) is None
+    assert held_out_problem(6.5, cut_out) is None
+
+
 def test_a_psnr_of_pictures_in_the_dark_says_nothing():
     rgb = np.zeros((1, 10, 10, 3), np.uint8)
     rgb[:, :5] = 2
