@@ -239,19 +239,20 @@ def evaluate(
     rows = table(
         "log", "predicted against", "frames", "mean |error|", "RMS", "worst", "bias", "r", "straight on"
     )
-    written = []
+    written, problems = [], list[str]()
     for each, folder in zip(opened, folders, strict=True):
         found = recorded_frames(each, loaded.view, expert)
         predicted = measure.predict(loaded.policy, found.frames.images, goals, found.drive_starts())
         for name, errors in measure.compared(found, predicted, labels, held_out).items():
             rows.add_row(each.name, name, *_error_cells(errors))
+            problems += [f"warning: {each.name}, {name}: {errors.problem}"] if errors.problem else []
         folder.mkdir(parents=True, exist_ok=True)
         measure.draw(found, predicted, f"{policy} on {each.name}", folder / "steering.png")
         files = measure.write_saliency(loaded.policy, found, folder, count, video, goals)
         written.append(f"{folder / 'steering.png'}, {len(files)} saliency files in {folder}")
     print_table(rows)
     notes = [f"{each.name}: {note}" for each in opened for note in each.log.notes]
-    print("\n".join([*notes, *crop_notes(opened, loaded.view), *written]))
+    print("\n".join([*problems, *notes, *crop_notes(opened, loaded.view), *written]))
 
 
 def _folders(output: Path | None, logs: list[OpenLog]) -> list[Path]:

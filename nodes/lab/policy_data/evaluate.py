@@ -23,6 +23,7 @@ from nodes.runtime.errors import ConfigError
 
 _BATCH = 64
 _VIDEO_SCALE = 4
+_REVERSED_R = -0.5
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,16 @@ class Errors:
     bias_rad: float
     correlation: float
     zero_rad: float
+
+    @property
+    def problem(self) -> str:
+        """Why these errors look like another side of the steering; empty if they do not."""
+        if not (self.correlation < _REVERSED_R and self.mean_abs_rad > self.zero_rad):
+            return ""
+        return (
+            f"the steering seems reversed (r {self.correlation:.2f}, errors larger than those of driving straight on): check steering-positive of the log, "
+            "and the side that the policy declares"
+        )
 
 
 def compare(predicted_rad: NDArray[np.floating[Any]], true_rad: NDArray[np.floating[Any]]) -> Errors:

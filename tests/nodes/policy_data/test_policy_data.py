@@ -196,6 +196,14 @@ def test_errors_against_numpy():
         compare(predicted, np.full(200, np.nan))
 
 
+@pytest.mark.parametrize(("gain", "is_told"), [(1.0, False), (-1.0, True), (-0.3, True), (0.0, False)])
+def test_steering_to_the_other_side_is_told(gain, is_told):
+    rng = np.random.default_rng(0)
+    true = rng.normal(0.0, 0.1, 200)
+    problem = compare(gain * true + rng.normal(0.0, 0.01, 200), true).problem
+    assert problem.startswith("the steering seems reversed (r -") is is_told
+
+
 def test_saliency_is_where_the_gradient_is():
     weight = torch.zeros(3, 66, 200)
     weight[:, 20, 150] = 1.0
