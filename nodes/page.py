@@ -71,7 +71,7 @@ class PageNode(Node):
         self._desk = Desk(config)
         self._disk = DiskWriter()
         self._diary = Diary(run_dir / LOG, self._disk)
-        self._recording = RecorderControl(run_dir, nodes)
+        self._recording = RecorderControl(run_dir, nodes, self._operates)
         path = None if room is None else room.reference_path
         off_track_m = _OFF_TRACK_M if room is None else room.off_track_m
         self._operation = Operation(

@@ -15,10 +15,17 @@ from advnerf_core.run_module import module_command
 from nodes.launching.launch_schema import NodeEntry
 
 _SHIM = Path(__file__).with_name("shim.py")
+# A recorder moves nothing, and its bag is finished if it may end in order.
+_ENDS_IN_ORDER = ("nodes.recorder",)
+
+
+def shim_command(supervisor_gone: signal.Signals = signal.SIGKILL) -> list[str]:
+    """Command before that of a program, which then gets this signal when the calling thread ends."""
+    return [sys.executable, "-I", "-S", str(_SHIM), str(os.getpid()), str(int(supervisor_gone))]
 
 
 class Child:
-    """The process of a node, in its own process group. It is killed when the thread that started it ends.
+    """The process of a node, in its own process group. It is killed when the thread that started it ends; a recorder gets SIGTERM.
 
     Args:
         name: Name of the node.
@@ -65,8 +72,9 @@ class Child:
     def start(self) -> None:
         """Start the process. Call it from a thread that outlives the process, because PDEATHSIG is sent when this thread ends."""
         self.log.parent.mkdir(parents=True, exist_ok=True)
+        gone = signal.SIGTERM if self.entry.module in _ENDS_IN_ORDER else signal.SIGKILL
         command = [
-            *(sys.executable, "-I", "-S", str(_SHIM), str(os.getpid())),
+            *shim_command(gone),
             *module_command(self.entry.module, "--config", str(self.config)),
             *("--folder", str(self._run_dir), "--name", self.name),
         ]

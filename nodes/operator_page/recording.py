@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import signal
@@ -14,6 +15,8 @@ from nodes.launching.child import Child
 from nodes.launching.launch_schema import NodeEntry
 
 RECORDER, LAUNCH_RECORDER, TELEOP = "page_recorder", "recorder", "/teleop/state"
+# Names the folder of a recording until its end is known to the page: one that starts beside it knows that an earlier one died.
+_RUNNING = Path("page/recording.txt")
 _SIGNAL_AFTER_S, _KILL_AFTER_S = 2.0, 10.0
 
 
@@ -22,14 +25,14 @@ class RecorderControl:
 
     Args:
         nodes: Nodes whose status is recorded too.
+        operates: Whether this page records; else it does not tell of another page's recording.
     """
 
-    def __init__(self, run_dir: Path, nodes: tuple[str, ...]) -> None:
+    def __init__(self, run_dir: Path, nodes: tuple[str, ...], operates: bool = True) -> None:
         self._run_dir, self._nodes = run_dir, nodes
         self._child: Child | None = None
-        self._folder = ""
         self._asked_s: float | None = None
-        self._trouble = ""
+        self._folder, self._trouble = _left_behind(run_dir) if operates else ("", "")
         self._connected = False
 
     @property
@@ -59,8 +62,10 @@ class RecorderControl:
         child = Child(RECORDER, NodeEntry(module="nodes.recorder"), self._run_dir)
         try:
             write_atomically(child.config, json.dumps(config))
+            write_atomically(self._run_dir / _RUNNING, self._folder)
             child.start()
         except OSError as error:  # a full disk must not end the page
+            self._forget()
             return f"cannot start a recorder: {error.strerror or error}"
         self._child, self._asked_s, self._trouble, self._connected = child, None, "", False
         return ""
@@ -90,6 +95,7 @@ class RecorderControl:
         if self._asked_s is None or child.exit_code:
             self._trouble = f"the recorder {child.how_it_ended()}"
         self._child = None
+        self._forget()
 
     def state(self) -> dict[str, object]:
         """Describe the recording and the space left on its disk, for the page."""
@@ -114,3 +120,21 @@ class RecorderControl:
             return
         self._child.signal(signal.SIGINT)
         self._child.wait_or_kill(_KILL_AFTER_S)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Note that the end of the recording is known."""
+        with contextlib.suppress(OSError):
+            (self._run_dir / _RUNNING).unlink(missing_ok=True)
+
+
+def _left_behind(run_dir: Path) -> tuple[str, str]:
+    """Folder of the recording of an earlier page, and what to say about it; both empty if that page knew how it ended."""
+    try:
+        folder = (run_dir / _RUNNING).read_text("utf-8")
+    except (OSError, UnicodeDecodeError):
+        return "", ""
+    return folder, (
+        f"The recording to {folder} ended with an earlier page; start recording again. If its bag is unfinished, advnerf bag repair "
+        f"{run_dir / folder} completes it."
+    )

@@ -8,17 +8,16 @@ import os
 import select
 import signal
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from advnerf_core.run_module import module_command
+from nodes.launching.child import shim_command
 from nodes.runtime.inbox import Inbox, ReaderThread
 
 # Names that nodes.experiment.node.search shares; the node does not import that, because it would bring torch.
 REQUEST, TOGETHER_STATE = "request.experiment.yaml", "together.state.safetensors"
-_SHIM = Path(__file__).parents[2] / "launching" / "shim.py"
 _READ_S = 0.2
 _PIECE = 1 << 16
 _END_S = 2.0
@@ -59,10 +58,9 @@ class Job:
         if threads:
             environment |= {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
         # It dies with the node, which then finds its state and resumes.
-        shim = [sys.executable, "-I", "-S", str(_SHIM), str(os.getpid())]
         with open(self.log, "ab") as log:
             self._process = subprocess.Popen(
-                [*shim, *module_command("nodes.experiment.node.worker", str(folder))],
+                [*shim_command(), *module_command("nodes.experiment.node.worker", str(folder))],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=log,
