@@ -118,6 +118,8 @@ class PageNode(Node):
             self._recording.heard(message)
         if topic == topics.SAFETY:
             self._operation.heard_safety(message, info)
+        elif topic in topics.LABELS:
+            self._operation.heard_label()
         elif topic == topics.SENT:
             self._operation.heard_motor(message, info)
         # A trial is measured by every pose, as in a bag, and not only by those at the page's own ticks.

@@ -18,6 +18,7 @@ SAFETY_STATE, ATTACK_SWITCH = "/safety/state", "/attack/switch"
 
 # Largest age of a message of the safety node.
 _AGE_LIMIT_NS = NS_PER_S // 2
+_SWITCHED_OFF = "switched off by "
 
 
 class Interlock:
@@ -56,4 +57,9 @@ class AttackSwitch:
 
     def refusal(self) -> str:
         """Return why the attack may not be shown; empty if it may."""
-        return f"switched off by {self._off_by}" if self._off_by else ""
+        return f"{_SWITCHED_OFF}{self._off_by}" if self._off_by else ""
+
+
+def switched_off_by(reason: str) -> str:
+    """Who switched the attack off, by the reason of a label (see `AttackSwitch.refusal`); empty if nobody did."""
+    return reason.removeprefix(_SWITCHED_OFF) if reason.startswith(_SWITCHED_OFF) else ""

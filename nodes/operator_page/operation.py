@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from advnerf_core.geometry import planar_pose
+from nodes.control.interlock import ATTACK_SWITCH, switched_off_by
 from nodes.launching.launched import Launched
 from nodes.operator_page.board import ViewState
 from nodes.operator_page.catalogue import CatalogueEntry
@@ -27,7 +28,7 @@ from nodes.runtime.requests import ESTOP_LATCHED
 from nodes.runtime.transfer import FileSender, chunk_messages
 from nodes.runtime.wire import MessageInfo
 
-ACT, RESET, SWITCH, FILE = "/operator/act", "/twin/reset", "/attack/switch", "/attack/file"
+ACT, RESET, SWITCH, FILE = "/operator/act", "/twin/reset", ATTACK_SWITCH, "/attack/file"
 _TELEOP_NS = NS_PER_S // 20
 _SWITCH_NS = NS_PER_S // 2
 # The e-stop's release and the request to re-arm travel on different topics, so the request waits.
@@ -112,6 +113,17 @@ class Operation:
             self._knows_latch = True
             if message.reason == ESTOP_LATCHED:
                 self.desk.stop()
+
+    def heard_label(self) -> None:
+        """Note a label of the node that shows the attack. Until somebody chooses here, an attack that was switched off stays so.
+
+        A page that starts repeats that, as the page did on which it was chosen. One that only watches follows the labels.
+        """
+        by = switched_off_by(str(getattr(self.board.label, "reason", "")))
+        if not self.operates:
+            self._show = not by
+        elif self._show is None and by:
+            self._show, self._switched_by = False, by
 
     def heard_motor(self, message: Any, info: MessageInfo) -> None:
         """Note a report of the motor node."""

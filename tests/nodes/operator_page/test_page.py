@@ -21,6 +21,7 @@ pytest.importorskip("starlette")
 pytest.importorskip("websockets")
 
 from nodes.page import PageConfig, PageNode
+from tests.support.faces import red_attack
 from tests.support.live.page_client import Browser, cookie_of, request
 from tests.support.messages import filled
 from tests.support.page import IN_TIME, TWIN, Run
@@ -527,5 +528,47 @@ def test_an_attack_is_chosen_and_switched_off(tmp_path):
         run.wait(lambda: not run.car.newest["/attack/switch"].show, "the attack to be switched off")
         assert run.car.newest["/attack/switch"].source == "Ann"
         ann.close()
+    finally:
+        run.close()
+
+
+def test_an_attack_that_was_switched_off_stays_so_when_page_and_compositor_start_again(tmp_path):
+    """The page said that it was chosen to be shown, and no longer repeated that it was not."""
+    attack, file = red_attack(tmp_path, "board")
+    run = Run(tmp_path, attacks=[str(file)])
+    run.configs["compositor"] = {"camera": str(TWIN / "camera.yaml"), "target": str(TWIN / "board.yaml")}
+    run.car.compositor = False
+
+    def again(name):
+        run.processes[name].kill()
+        run.processes[name].wait()
+        run.start(name)
+
+    def seen(browser, reason):
+        return (browser.state["attack"] or {}).get("reason") == reason
+
+    try:
+        run.start()
+        ann = Browser(run.port)
+        ann.wait(lambda: ann.state["attack"], "a label of the compositor")
+        assert ann.state["chosen"]["show"]
+        ann.take()
+        assert ann.do("attack_off") == ""
+        ann.wait(lambda: seen(ann, "switched off by Ann"), "the attack to be switched off")
+        (tmp_path / "page" / "door.json").unlink()
+        again("page")
+        bob = Browser(run.port)
+        bob.wait(lambda: not bob.state["chosen"]["show"], "the choice to be taken over")
+        again("compositor")
+        since_ns = time.monotonic_ns()
+        run.wait(lambda: run.car.heard["/attack/switch"][-1][0] > since_ns, "the choice to be repeated")
+        switch = run.car.newest["/attack/switch"]
+        assert (switch.show, switch.source) == (False, "Ann")
+        bob.wait(lambda: seen(bob, "switched off by Ann"), "the new compositor to hear it")
+        assert bob.take("Bob") == ""
+        assert bob.do("attack", id=attack.attack_id) == ""
+        bob.wait(lambda: bob.state["chosen"]["show"], "the choice of Bob")
+        run.wait(lambda: run.car.newest["/attack/switch"].show, "the attack to be switched on")
+        assert bob.state["chosen"]["show"], "an earlier label does not undo a choice"
     finally:
         run.close()
