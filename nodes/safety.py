@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from advnerf_core.strict import LagS, LengthM, RightAngleRad, SpeedMps, StrictModel
+from calibration.fence import edge_distance_m
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from hardware.cameras.interface import RECORDED
 from nodes.control.arming import MAX_SPEED_MPS, Arming, ArmingLimits
@@ -27,7 +28,7 @@ from nodes.control.stamps import (
     stamp_problem,
 )
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.errors import MessageError
+from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import drive_message, header, pose_matrix, types
 from nodes.runtime.messages import stamp_ns as stamp_of
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
@@ -126,7 +127,16 @@ class SafetyConfig(StrictModel):
         return StallGate(limits)
 
     def limits(self, room: RoomCalibration) -> ArmingLimits:
-        """Make the limits of the arming."""
+        """Make the limits of the arming.
+
+        Raises:
+            ConfigError: The margin keeps the car from being armed at the start of the room.
+        """
+        if (inside_m := edge_distance_m(room.start_pose[:2], room.fence_m)) < self.fence_margin_m:
+            raise ConfigError(
+                f"expected safety.fence_margin_m of at most {inside_m:.2f} m, the distance of the room's start_pose from its fence, got "
+                f"{self.fence_margin_m:g} m (is it in cm?), by which the car could not be armed there"
+            )
         return ArmingLimits(
             nodes=self.nodes,
             fence_m=room.fence_m,

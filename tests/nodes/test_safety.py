@@ -9,11 +9,12 @@ import pytest
 from pydantic import ValidationError
 
 from advnerf_core.geometry import planar_pose
-from calibration.schema import VehicleCalibration, load_calibration
+from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from nodes.control.arming import ArmingLimits
 from nodes.motor import MotorConfig
 from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.clock import Now
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_message, types
 from nodes.runtime.node import MessageInfo
 from nodes.runtime.requests import RequestIdentity
@@ -311,3 +312,17 @@ def test_a_limit_in_another_unit_guards_nothing_and_is_refused(model, key, value
     port = {"port": "/dev/vesc"} if model is MotorConfig else {}
     with pytest.raises(ValidationError, match=said):
         model(**needed, **port, **{key: value})
+
+
+@pytest.mark.parametrize(("margin_m", "refused"), [(0.1, False), (1.49, False), (1.6, True), (10.0, True)])
+def test_a_margin_by_which_the_start_of_the_room_is_outside_is_refused(margin_m, refused):
+    """10 cm that were given as 10 m let no car be armed anywhere."""
+    config = SafetyConfig(room=TWIN / "room.yaml", vehicle=TWIN / "vehicle.yaml", fence_margin_m=margin_m)
+    room = load_calibration(RoomCalibration, config.room)
+    if not refused:
+        assert config.limits(room).fence_margin_m == margin_m
+        return
+    with pytest.raises(
+        ConfigError, match=rf"fence_margin_m of at most 1\.50 m, .*got {margin_m:g} m .is it in cm"
+    ):
+        config.limits(room)

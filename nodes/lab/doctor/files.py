@@ -9,6 +9,7 @@ from typing import Any
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.strict import validate
 from calibration.panel import MonitorPanel, require_fits, target_size
 from calibration.schema import (
     Calibration,
@@ -23,6 +24,7 @@ from nodes.calibration_drive import UNREAD_KEYS
 from nodes.compositor import show
 from nodes.lab.doctor.check import FAILURE, OK, WARNING, CheckResult, report
 from nodes.launching.launch_file import Plan
+from nodes.safety import SafetyConfig
 
 _CURE = "run advnerf car calibrate (docs/calibration.md), or set params.calibration to the right folder"
 _PATH_CURE = "correct the path, which is relative to the current folder"
@@ -33,6 +35,7 @@ _COMMON: dict[str, type[Calibration]] = {
 _OWN: dict[str, type[Calibration]] = {"nodes.camera": CameraCalibration, "nodes.motor": VehicleCalibration}
 # Keys that a node does not read, by its module.
 _UNREAD = {"nodes.calibration_drive": UNREAD_KEYS}
+_SAFETY = "nodes.safety"
 _FILES = (".safetensors", ".onnx", ".pt2", ".conf", ".yaml", ".mcap", ".db3", ".bag")
 
 
@@ -72,13 +75,16 @@ def _calibration_files(plan: Plan) -> Iterator[tuple[Path, type[Calibration]]]:
 
 
 def named(plan: Plan) -> list[CheckResult]:
-    """Check that every other file exists, and that attacks fit camera and face."""
-    return [*_absent(plan), *_attacks(plan)] or report("files", OK, "all files that the nodes name exist")
+    """Check that every other file exists, that attacks fit camera and face, and that the car can be armed in the room."""
+    return [*_absent(plan), *_attacks(plan), *_margins(plan)] or report(
+        "files", OK, "all files that the nodes name exist"
+    )
 
 
 def unusable(plan: Plan) -> list[str]:
-    """The errors of calibrations and attacks, without which no node starts, as one line each."""
-    return [_line(row) for row in (*calibrations(plan), *_attacks(plan)) if row.state == FAILURE]
+    """The errors of calibrations, attacks and the fence's margin, without which no node starts, as one line each."""
+    rows = (*calibrations(plan), *_attacks(plan), *_margins(plan))
+    return [_line(row) for row in rows if row.state == FAILURE]
 
 
 def missing(plan: Plan) -> list[str]:
@@ -103,6 +109,22 @@ def _attacks(plan: Plan) -> list[CheckResult]:
         data = plan.documents[name].data
         if isinstance(data, dict) and data.get("attack"):
             found += _attack(name, data)
+    return found
+
+
+def _margins(plan: Plan) -> list[CheckResult]:
+    """Check that the safety node's margin leaves the start of the room inside the fence."""
+    found: list[CheckResult] = []
+    for name in (name for name, entry in plan.nodes.items() if entry.module == _SAFETY):
+        try:
+            config = validate(SafetyConfig, plan.documents[name])
+            room = load_calibration(RoomCalibration, config.room)
+        except AdvnerfError:
+            continue  # reported under "nodes" or "calibration"
+        try:
+            config.limits(room)
+        except AdvnerfError as error:
+            found += report("fence", FAILURE, f"{name}: {error}", "correct the launch file or the room")
     return found
 
 

@@ -311,6 +311,17 @@ def test_a_target_by_which_the_attack_is_shown_turned_is_told_before_the_launch(
     assert "got a face upside down: they begin 2 corners later, at the bottom right one" in said
 
 
+def test_a_margin_in_centimetres_is_told_before_the_launch_and_by_the_doctor():
+    assert files.unusable(plan_of("green_screen", "safety.fence_margin_m=0.1")) == []
+    wrong = plan_of("green_screen", "safety.fence_margin_m=10")
+    (said,) = files.unusable(wrong)
+    assert said.startswith("safety: expected safety.fence_margin_m of at most 1.50 m")
+    assert said.endswith(
+        "got 10 m (is it in cm?), by which the car could not be armed there; correct the launch file or the room"
+    )
+    assert [row.state for row in files.named(wrong) if row.check == "fence"] == [FAILURE]
+
+
 def _no_folder(folder):
     return [
         "params.calibration=nosuch"
