@@ -16,8 +16,13 @@ def gate(
     file: File,
     setting: Setting = None,
     run_folder: Folder = None,
-    path: Annotated[str, typer.Option(help="Which path; the views that are compared are of all.")] = "",
-    victim: Annotated[str, typer.Option(help="Victim: hardened or naive.")] = "hardened",
+    path: Annotated[
+        str,
+        typer.Option(help="Path of the experiment; none: the first. The views that are compared are of all."),
+    ] = "",
+    victim: Annotated[
+        str, typer.Option(help="Victim of the experiment, by its name; none: the main one.")
+    ] = "",
     bag: Annotated[
         Path | None, typer.Option(help="Bag of a drive without an attack, to compare as well.", exists=True)
     ] = None,
@@ -35,14 +40,21 @@ def gate(
     overrides: Overrides = None,
 ) -> None:
     """Compare learned with real views by image quality and by the policy's steering. Exit code 1 if the surrogate fails."""
+    from advnerf_core.plugins import unknown
     from advnerf_core.report.conditions import NONE
     from advnerf_core.scene.gate_limits import GateLimits
     from nodes.experiment.plan.cell import Cell
     from nodes.experiment.run.gate import judge_scene
     from nodes.experiment.steps.run import load_experiment
+    from nodes.runtime.errors import ConfigError
 
     experiment = load_experiment(file, setting, overrides or [], run_folder)
     experiment.require_one()
+    config = experiment.config
+    path, victim = path or config.paths[0], victim or config.main_victim
+    for what, name, names in (("path", path, config.paths), ("victim", victim, config.all_victims)):
+        if name not in names:
+            raise ConfigError(f"{file}: --{what}: {unknown(name, what, names)}")
     wanted = {"psnr_db": psnr_db, "ssim": ssim, "steering": steering}
     limits = GateLimits.model_validate({name: value for name, value in wanted.items() if value is not None})
     verdicts = judge_scene(experiment, Cell(path, victim, NONE, 0), limits, bag)

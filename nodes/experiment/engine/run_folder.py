@@ -22,7 +22,6 @@ from nodes.experiment.plan.cell import Cell, cells_of
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.experiment_file import read_experiment_file
 from nodes.experiment.plan.over import OVER
-from nodes.experiment.plan.victims import RETRAINED
 from nodes.lab.located import READ_AGAIN
 from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
@@ -173,9 +172,8 @@ def _check_cells(made: RunFolder, document: Document) -> None:
 
     for variant, config in made.variants.items() or (("", made.config),):
         within = f" in {variant}" if variant else ""
-        victims = (*config.attacked, *((RETRAINED,) if config.retrain else ()))
         for victim in config.over.victim or ():
-            require(victim, f"victim{within}", victims, OVER, "victim")
+            require(victim, f"victim{within}", config.all_victims, OVER, "victim")
         for path in config.over.path or ():
             require(path, f"path{within}", config.paths, OVER, "path")
     for index, contrast in enumerate(made.config.contrasts):

@@ -150,6 +150,11 @@ class ExperimentConfig(StrictModel):
         }
 
     @property
+    def all_victims(self) -> tuple[str, ...]:
+        """Names of the attacked policies, the main one first, and of the retrained one if there is one."""
+        return (*self.attacked, *((RETRAINED,) if self.retrain else ()))
+
+    @property
     def trained(self) -> dict[str, TrainingConfig]:
         """The victims that are trained here, each with all keys of its training."""
         return {name: each.train for name, each in self.attacked.items() if isinstance(each, TrainedVictim)}

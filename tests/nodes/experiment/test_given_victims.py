@@ -483,3 +483,25 @@ def test_live_nodes_drive_a_users_file(folder: Path, tmp_path: Path) -> None:
     assert len(found["deployed"]["total_cte_m"]) == 1, found["not_driven_live"]
     page = (experiment.folder / "report" / "report.html").read_text()
     assert "the victim has no gradient" in page
+
+
+def test_the_gate_judges_the_main_victim_and_refuses_a_name_that_is_none(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def gate(*words: str) -> tuple[object, str, str]:
+        asked = ["scene", "gate", folder / "mine.experiment.yaml", "--setting", "tiny", "--folder"]
+        code = advnerf(monkeypatch, *asked, folder / "run", "--json", *words)
+        return code, *capsys.readouterr()
+
+    code, judged, _ = gate()
+    assert code in (0, 1)
+    assert gate("--victim", "mine", "--path", "track")[1] == judged != ""
+    for wrong, told in (
+        (("--victim", "nosuch"), "--victim: expected a victim of mine, module; got 'nosuch'"),
+        (("--victim", "hardened"), "--victim: expected a victim of mine, module; got 'hardened'"),
+        (("--path", "trak"), "--path: expected a path of track; got 'trak' (did you mean track?)"),
+    ):
+        code, _, said = gate(*wrong)
+        assert code == 2
+        assert len(said.strip().splitlines()) == 1
+        assert told in said
