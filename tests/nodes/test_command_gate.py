@@ -1,10 +1,13 @@
 """The gate before the motor controller: every way in which commands may cease, with time handed to it."""
 
 import math
+from pathlib import Path
 
 import pytest
 
+from nodes.control.arming import ArmingLimits
 from nodes.control.command_gate import Brake, CommandGate, Drive, GateSettings, GateState
+from nodes.control.stamps import AHEAD_LIMIT_S, COMMAND_AGE_S
 from nodes.runtime.wire import MessageInfo
 
 pytestmark = pytest.mark.live
@@ -200,3 +203,10 @@ def test_link_fault_latches(driving):
     driving.let_pass(2000)
     driving.gate.brake_again(driving.ms * MS)
     assert driving.tick().current_a > 0.0
+
+
+def test_the_page_names_the_ages_at_which_safety_and_motor_refuse_a_command():
+    page = (Path(__file__).parents[2] / "docs" / "cars.md").read_text(encoding="utf-8")
+    (row,) = [line for line in page.splitlines() if line.startswith("| command from an old image")]
+    safety_s, motor_s = ArmingLimits.image_age_s, COMMAND_AGE_S
+    assert f"{safety_s:g} s old, then {motor_s:g} s; {AHEAD_LIMIT_S:g} s ahead" in row
