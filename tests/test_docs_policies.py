@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from advnerf_core.policies.architecture import PilotNetConfiguration
+from nodes.experiment.plan.sections import PolicyConfig
+
 pytestmark = pytest.mark.live
 
 REPOSITORY = Path(__file__).parents[1]
@@ -76,3 +79,9 @@ def test_the_commands_of_the_page_check_export_and_describe_it(folder):
     assert "differentiable  False" in " ".join(told.stdout.split()).replace(
         "differentiable False", "differentiable  False"
     )
+
+
+def test_the_page_names_the_widths_of_pilotnet_here_and_in_experiments():
+    here = PilotNetConfiguration().hidden
+    there = PolicyConfig().hidden
+    assert f"- `pilotnet`: `hidden` {here}; in experiments `policy.hidden` {there}" in PAGE
