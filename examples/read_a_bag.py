@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import planar_pose
 from nodes.bags import BagWriter, read_info, read_messages
 from nodes.runtime import decode, drive_message, encode, pose_matrix, pose_message, stamp_ns, topic
@@ -50,4 +51,7 @@ def show(bag: Path) -> None:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as temporary:
-        show(Path(sys.argv[1]) if len(sys.argv) > 1 else write_circle(Path(temporary) / "circle"))
+        try:
+            show(Path(sys.argv[1]) if len(sys.argv) > 1 else write_circle(Path(temporary) / "circle"))
+        except AdvnerfError as error:
+            raise SystemExit(f"error: {error}") from None

@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from nodes.bags import read_info, read_messages
+from nodes.lab import ros2_policy
 from nodes.replaying.nodes import Choice
 from nodes.replaying.replay import Replay
 from nodes.runtime import decode, stamp_ns
@@ -79,6 +80,22 @@ def imported(file):
         elif isinstance(node, ast.Import):
             names |= {alias.name.partition(".")[0] for alias in node.names}
     return names
+
+
+@pytest.mark.parametrize(
+    ("file", "arguments", "told"),
+    [
+        ("read_a_bag", ["no_such_bag"], "no_such_bag does not exist; expected a bag folder"),
+        ("ros2_black_box", [], "expected a ROS 2 program that subscribes to /image_raw"),
+    ],
+)
+def test_an_example_that_lacks_its_input_ends_in_one_line(file, arguments, told, monkeypatch, capsys):
+    monkeypatch.setattr(ros2_policy, "_FIND_S", 0.1)  # not half a minute
+    monkeypatch.setattr(sys, "argv", [file, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        run_here(f"{file}.py", capsys)
+    assert str(ended.value).startswith(f"error: {told}")
+    assert len(str(ended.value).splitlines()) == 1
 
 
 @pytest.fixture(scope="module")

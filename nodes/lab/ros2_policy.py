@@ -75,10 +75,11 @@ class Ros2Network(nn.Module):
         deadline = time.monotonic() + _FIND_S
         while not (self._side.present(0) and self._side.readers_of(0)):
             if time.monotonic() > deadline:
-                raise BusError(
+                told = (
                     f"expected a ROS 2 program that subscribes to {self._names[0]} and publishes {self._type} on {self._names[1]},"
                     f" found none in {_FIND_S:g} s; start it with the same ROS_DOMAIN_ID. {self._side.mismatch(0)}"
                 )
+                raise BusError(told.rstrip())
             time.sleep(0.05)
 
     def _ask(self, rgb: Any) -> float:
