@@ -202,8 +202,9 @@ def _problems(plan: Any) -> list[str]:
     """All errors. The policies are loaded, in seconds, only if nothing else is wrong."""
     from nodes.lab.doctor import files
     from nodes.lab.doctor.launch import policy_problems
+    from nodes.launching.one_car import unprovided
 
-    return _cheap_problems(plan) or files.missing(plan) or policy_problems(plan)
+    return _cheap_problems(plan) or unprovided(plan) or files.missing(plan) or policy_problems(plan)
 
 
 def _refuse(problems: Sequence[str]) -> None:

@@ -34,6 +34,7 @@ class Plan:
         documents: Configuration of each enabled node with the places of its keys, for error messages.
         resolved: The complete launch as plain data, to be stored with the results.
         run_dir: Value of ``${run_dir}``.
+        socket_dir: Value of ``${socket_dir}``.
     """
 
     file: Path
@@ -41,6 +42,7 @@ class Plan:
     documents: dict[str, Document]
     resolved: dict[str, Any]
     run_dir: str
+    socket_dir: str
 
     @property
     def nodes(self) -> dict[str, NodeEntry]:
@@ -71,8 +73,8 @@ def load_launch(
         raise ConfigError(f"{document.place(())}: expected a launch file with keys name and nodes")
     for override in overrides:
         _apply_override(document, override)
-    socket_dir = str(bus_folder(run_dir)) if isinstance(run_dir, Path) else "<socket_dir>"
     twin = shipped("calibration/twin") if twin_calibration is None else twin_calibration
+    socket_dir = str(bus_folder(run_dir)) if isinstance(run_dir, Path) else "<socket_dir>"
     own = {"run_dir": str(run_dir), "socket_dir": socket_dir, "twin_calibration": str(twin)}
     params = {**(document.data.get("params") or {}), **own}
     document.data = with_absolute_code(_substitute(document.data, params, document, ()), file.parent)
@@ -86,7 +88,7 @@ def load_launch(
     for name in enabled:
         _check(name, launch.nodes[name], document)
     documents = {name: document.part(("nodes", name, "config")) for name in enabled}
-    return Plan(file, launch, documents, document.data, str(run_dir))
+    return Plan(file, launch, documents, document.data, str(run_dir), socket_dir)
 
 
 def _read_with_includes(file: Path, above: tuple[Path, ...]) -> Document:

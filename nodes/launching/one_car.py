@@ -14,6 +14,12 @@ from nodes.runtime.twin_port import PORT
 
 _TWIN, _MOTOR, _SAFETY = "nodes.twin", "nodes.motor", "nodes.safety"
 _COMMANDING = ("nodes.expert", "nodes.policy", "nodes.teleop", "nodes.calibration_drive")
+# Where a node names the device that only the twin of the same run makes: its place, and the kinds of device that are one.
+_OF_THE_TWIN = (
+    (_MOTOR, ("port",), ()),
+    ("nodes.camera", ("source", "path"), ("socket",)),
+    ("nodes.monitor", ("display", "path"), ("twin",)),
+)
 # Nodes whose messages are conditions of arming only if the safety node waits for them.
 _CONDITIONS = (
     (_MOTOR, "motor", "the car drives without a check of its time-out, its wheels and its telemetry"),
@@ -54,6 +60,24 @@ def mixtures(plan: Plan) -> dict[str, str]:
             f"{plan.documents[safety].place(('vehicle',))}: expected one vehicle file for {safety} and {motor}, got {guard['vehicle']} and {vehicle}; the "
             "limits of one car do not hold for another"
         )
+    return found
+
+
+def unprovided(plan: Plan) -> list[str]:
+    """Devices in the folders of the run that no node of the launch makes, as one line each."""
+    if any(entry.module == _TWIN for entry in plan.nodes.values()):
+        return []
+    own, found = {Path(folder).resolve() for folder in (plan.run_dir, plan.socket_dir)}, []
+    for module, place, kinds in _OF_THE_TWIN:
+        for name in (name for name, entry in plan.nodes.items() if entry.module == module):
+            document = plan.documents[name].part(place)
+            parent = plan.documents[name].part(place[:-1]).data
+            value, kind = document.data, parent.get("kind") if isinstance(parent, dict) else None
+            if isinstance(value, str) and _placed(value).parent in own and (not kinds or kind in kinds):
+                found.append(
+                    f"{plan.documents[name].place(place)}: expected a real device as {name}.{'.'.join(place)}, got {value}, which only the simulated "
+                    "lab of a run makes, and this launch has none; name the device, or enable the lab (twin.if=true)"
+                )
     return found
 
 

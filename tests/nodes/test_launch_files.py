@@ -10,7 +10,7 @@ import pytest
 from nodes.launching.launch_check import check_nodes
 from nodes.launching.launch_file import load_launch
 from nodes.launching.launched import Launched, read_launched
-from nodes.launching.one_car import mixtures
+from nodes.launching.one_car import mixtures, unprovided
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.paths import RESOLVED_NAME
 
@@ -137,6 +137,43 @@ def test_a_car_that_was_measured_is_one_car(tmp_path):
         (tmp_path / file.name).write_text(file.read_text().replace("by construction", "measured"))
     real = ["twin.if=false", "motor.port=/dev/vesc", f"params.calibration={tmp_path}"]
     assert mixtures(load_launch(LAUNCH / "green_screen.launch.yaml", real)) == {}
+
+
+SCREEN = "monitor.display={kind: screen, index: 1, connector: HDMI-A-1}"
+REAL_CAMERA = "camera.source={kind: folder, folder: pictures}"
+
+
+@pytest.mark.parametrize(
+    ("file", "settings", "missing"),
+    [
+        ("monitor", [], []),
+        ("monitor", ["twin.if=false"], ["motor.port", "camera.source.path", "monitor.display.path"]),
+        ("monitor", ["twin.if=false", SCREEN, REAL_CAMERA], ["motor.port"]),
+        ("monitor", ["twin.if=false", SCREEN, REAL_CAMERA, "motor.port=/dev/vesc"], []),
+        ("collect", ["twin.if=false"], ["motor.port", "camera.source.path"]),
+        ("collect", ["twin.if=false", "camera.source={kind: socket, path: /tmp/own}"], ["motor.port"]),
+        ("robot", [], []),
+        ("workstation", [], []),
+    ],
+)
+@pytest.mark.parametrize("placed", [True, False])
+def test_a_device_that_only_the_simulated_lab_makes_is_missed_where_there_is_none(
+    file, settings, missing, placed, tmp_path
+):
+    folder = tmp_path / "run" if placed else "<run_dir>"
+    said = unprovided(load_launch(LAUNCH / f"{file}.launch.yaml", settings, folder))
+    assert [re.search(r"expected a real device as (\S+), got", line)[1] for line in said] == missing
+
+
+def test_the_check_of_a_launch_says_it(tmp_path):
+    policy = "examples.my_policy:factory"
+    settings = ["--set", "twin.if=false", "--set", f"params.policy={policy}"]
+    program = [sys.executable, "-m", "nodes.cli", "launch", LAUNCH / "green_screen.launch.yaml", "--check"]
+    done = subprocess.run(
+        [*program, *settings], capture_output=True, text=True, cwd=LAUNCH.parent, timeout=600
+    )
+    assert done.returncode == 2
+    assert "expected a real device as motor.port, got <run_dir>/vesc" in done.stderr
 
 
 @pytest.mark.parametrize("check", [["--check"], []])
