@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from nodes.lab.doctor import files
 from nodes.launching.launch_check import check_nodes
 from nodes.launching.launch_file import load_launch
 from nodes.launching.launched import Launched, read_launched
@@ -137,6 +138,19 @@ def test_a_car_that_was_measured_is_one_car(tmp_path):
         (tmp_path / file.name).write_text(file.read_text().replace("by construction", "measured"))
     real = ["twin.if=false", "motor.port=/dev/vesc", f"params.calibration={tmp_path}"]
     assert mixtures(load_launch(LAUNCH / "green_screen.launch.yaml", real)) == {}
+
+
+@pytest.mark.parametrize("off", [[], ["safety.if=false", "motor.if=false"]])
+def test_a_car_records_for_its_calibration_by_nominal_files(tmp_path, off):
+    """As docs/first_day.md makes the first files: those that the calibration writes are not there yet."""
+    for file in (LAUNCH.parent / "calibration" / "twin").iterdir():
+        (tmp_path / file.name).write_text(
+            file.read_text().replace("method: by construction", "method: nominal")
+        )
+    camera = "params.camera={kind: v4l2, device: /dev/video0, width: 336, height: 188}"
+    plan = load_launch(LAUNCH / "robot.launch.yaml", [f"params.calibration={tmp_path}", camera, *off])
+    assert "recorder" in plan.nodes
+    assert [*check_nodes(plan), *files.unusable(plan), *files.missing(plan), *unprovided(plan)] == []
 
 
 SCREEN = "monitor.display={kind: screen, index: 1, connector: HDMI-A-1}"
