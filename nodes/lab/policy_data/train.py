@@ -19,7 +19,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.expert import Expert
 from advnerf_core.files import write_atomically, write_json
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
-from advnerf_core.learning.frames import Frames, FrameSet, FrameStore
+from advnerf_core.learning.frames import HOLDOUT_BLOCK, Frames, FrameSet, FrameStore
 from advnerf_core.learning.imitation import ImitationProgress, train_policy
 from advnerf_core.learning.recipe import ImitationConfig, SourcePlan
 from advnerf_core.places import require_utf8
@@ -69,7 +69,7 @@ def train_from_recordings(
     recordings or settings start a new training, and remove the earlier work when they are finished.
 
     Raises:
-        LogError: Two logs have the same images.
+        LogError: Two logs, or two parts of one, have the same images.
     """
     require_utf8(out.absolute())
     digests = {log.name: _digest_of(log) for log in logs}
@@ -127,18 +127,35 @@ def _cut(
 
 
 def _refuse_shared_images(shards: Mapping[str, Frames]) -> None:
-    """Refuse one drive in two logs, in whatever formats: what is held out of one would be learned from the other."""
+    """Refuse one drive twice, in one log or in two, in whatever formats: what is held out of one would be learned from the other."""
     images = {
-        name: {hashlib.sha256(image.tobytes()).digest() for image in shard.images}
-        for name, shard in (shards.items() if len(shards) > 1 else ())
+        name: [hashlib.sha256(image.tobytes()).digest() for image in shard.images]
+        for name, shard in shards.items()
     }
-    for one, other in combinations(images, 2):
-        shared = len(images[one] & images[other])
-        if shared > _MOST_SHARED * min(len(images[one]), len(images[other])):
+    for name, digests in images.items():
+        if (again := _shown_again(digests)) > _MOST_SHARED * len(digests):
+            raise LogError(
+                f"expected every drive once, as its frames are learned from or held out, got {name}, in which {again} of {len(digests)} images "
+                "are those of an earlier part; remove one of the parts"
+            )
+    distinct = {name: set(digests) for name, digests in images.items()}
+    for one, other in combinations(distinct, 2):
+        shared = len(distinct[one] & distinct[other])
+        if shared > _MOST_SHARED * min(len(distinct[one]), len(distinct[other])):
             raise LogError(
                 f"expected every drive once, as its frames are learned from or held out, got {one} and {other}, which have {shared} images "
                 "in common; remove one of them"
             )
+
+
+def _shown_again(digests: Sequence[bytes]) -> int:
+    """Number of images that were seen before, but not within the last block of frames: those of a standing car are no copies."""
+    last: dict[bytes, int] = {}
+    again = 0
+    for number, digest in enumerate(digests):
+        again += number - last.get(digest, number) > HOLDOUT_BLOCK
+        last[digest] = number
+    return again
 
 
 def _clone(

@@ -268,22 +268,43 @@ def test_a_map_without_a_gradient_is_refused(steer, got):
         saliency(lambda images, goals: steer(images), np.zeros((2, 66, 200, 3), np.uint8))
 
 
+IMAGES = np.random.default_rng(0).integers(0, 256, (100, 66, 200, 3), dtype=np.uint8)
+
+
+def shard(rows):
+    count = len(rows)
+    numbers = np.zeros((count, 3)), np.zeros(count, np.float32), np.zeros((count, 0), np.float32)
+    return Frames(IMAGES[rows], *numbers, np.zeros(count, bool))
+
+
 @pytest.mark.parametrize(("common", "refused"), [(40, True), (10, True), (4, False), (0, False)])
 def test_images_that_another_log_has_are_not_held_out(common, refused):
     """The second log has the last images of the first, in another order."""
-    images = np.random.default_rng(0).integers(0, 256, (100, 66, 200, 3), dtype=np.uint8)
-
-    def frames(rows):
-        count = len(rows)
-        numbers = np.zeros((count, 3)), np.zeros(count, np.float32), np.zeros((count, 0), np.float32)
-        return Frames(images[rows], *numbers, np.zeros(count, bool))
-
-    logs = {"one": frames(np.arange(50)), "two": frames(np.arange(50 - common, 100 - common)[::-1])}
+    logs = {"one": shard(np.arange(50)), "two": shard(np.arange(50 - common, 100 - common)[::-1])}
     said = pytest.raises(
         LogError, match=f"every drive once.* got one and two, which have {common} images in common"
     )
     with said if refused else contextlib.nullcontext():
         training._refuse_shared_images(logs)
+
+
+@pytest.mark.parametrize(
+    ("rows", "again"),
+    [
+        ([*range(50), *range(50)], 50),
+        ([*range(100), *range(80, 60, -1)], 20),
+        ([*range(100), *range(5)], 0),
+        ([*range(20), *[20] * 100, *range(21, 60), *[20] * 5], 0),  # a standing car, at one place twice
+        ([*[3, 4] * 50, *range(5, 60)], 0),
+        (np.arange(100) // 2, 0),  # a slow camera
+    ],
+)
+def test_a_drive_that_is_in_one_log_twice_is_refused(rows, again):
+    said = pytest.raises(
+        LogError, match=f"every drive once.* got one, in which {again} of {len(rows)} images"
+    )
+    with said if again else contextlib.nullcontext():
+        training._refuse_shared_images({"one": shard(np.array(rows))})
 
 
 def test_training_learns_is_kept_and_begins_anew_for_other_recordings(tmp_path, monkeypatch):
