@@ -42,6 +42,7 @@ _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 _LARGEST = 2**53
 # Exceptions that PyArrow raises for a damaged file beside its own.
 _NONSENSE = (OSError, ValueError, KeyError, IndexError, TypeError, OverflowError, MemoryError)
+_Place = tuple[Path, float]  # a video and a time in it [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,22 +122,28 @@ def read_lerobot(path: Path, choice: LogChoice) -> DriveLog:
     columns += [DISTURBED] if data.is_ours and DISTURBED in data.features else []
     table = data.rows(columns)
     _require_consistent(data, table)
-    count = len(table["timestamp"])
+    places = _video_places(data, images, table) if data.features[images]["dtype"] == "video" else []
+    rows = _in_video_order(places) if places else list(range(len(table["timestamp"])))
+    table = {name: column[rows] for name, column in table.items()}
+    count = len(rows)
     values = _values(data, table, steering) if steering else np.full(count, math.nan)
     speed = f"{_ACTION}:{SPEED_NAME}"
     speeds = _values(data, table, speed) if data.is_ours and speed in controls else np.full(count, math.nan)
     states = table[state] if state else np.full((count, 3), math.nan)
-    stamps = _stamps(data, table["episode_index"][:, 0])
+    stamps = _stamps(data, table["episode_index"][:, 0], rows)
     disturbed = table[DISTURBED][:, 0] if DISTURBED in table else np.zeros(count)
 
     def frames() -> Iterator[LogFrame]:
-        for row, rgb in enumerate(_images(data, images, table)):
+        shown = (
+            _filmed_images(data, [places[row] for row in rows]) if places else _stored_images(data, images)
+        )
+        for row, rgb in enumerate(shown):
             x_m, y_m, yaw_rad = states[row] if state else NOWHERE
             yield LogFrame(
                 rgb,
                 int(stamps[row]),
                 float(values[row]),
-                f"{path}, frame {row}",
+                f"{path}, frame {rows[row]}",
                 float(speeds[row]),
                 (float(x_m), float(y_m), float(yaw_rad)),
                 disturbed=bool(disturbed[row]),
@@ -240,29 +247,32 @@ def _is_about(rate_hz: float, expected_hz: float) -> bool:
     return abs(rate_hz / expected_hz - 1.0) <= _RATE_TOLERANCE
 
 
-def _stamps(data: _DataSet, episodes: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Capture times [ns]. Numbers of nanoseconds since 1970 are no ``float64``, so they are read unchanged.
+def _stamps(data: _DataSet, episodes: NDArray[np.float64], rows: Sequence[int]) -> NDArray[np.int64]:
+    """Capture times ``[N]`` [ns]. Numbers of nanoseconds since 1970 are no ``float64``, so they are read unchanged.
 
     Args:
         episodes: Episode ``[N]`` of each frame.
+        rows: Row ``[N]`` of the tables of each frame.
     """
     if not (data.is_ours and STAMP in data.features):
         pauses = np.cumsum(np.diff(episodes, prepend=episodes[:1]) != 0)
         return np.round(1e9 * (np.arange(len(episodes)) / data.fps + _PAUSE_S * pauses)).astype(np.int64)
     values = [value for file in data.tables for value in read_table(file, [STAMP])[STAMP].to_pylist()]
     try:
-        return np.array(values, np.int64)
+        return np.array(values, np.int64)[rows]
     except (TypeError, ValueError, OverflowError) as error:
         raise LogError(
             f"{data.path}: {STAMP}: expected times [ns], got something else; export the log again"
         ) from error
 
 
-def _images(data: _DataSet, name: str, table: dict[str, NDArray[np.float64]]) -> Iterator[Rgb]:
-    if data.features[name]["dtype"] == "image":
-        yield from _stored_images(data, name)
-        return
-    places = _video_places(data, name, table)
+def _in_video_order(places: Sequence[_Place]) -> list[int]:
+    """Numbers of the rows as their videos show them: tables may have the episodes in another order."""
+    order = {file: number for number, file in enumerate(dict.fromkeys(file for file, _ in places))}
+    return sorted(range(len(places)), key=lambda row: (order[places[row][0]], places[row][1]))
+
+
+def _filmed_images(data: _DataSet, places: Sequence[_Place]) -> Iterator[Rgb]:
     for file, group in groupby(places, key=lambda place: place[0]):
         yield from frames_at(file, [time_s for _, time_s in group], 0.5 / data.fps)
 
@@ -285,9 +295,7 @@ def _column(file: Path, name: str) -> Iterator[Any]:
             yield from batch.column(0).to_pylist()
 
 
-def _video_places(
-    data: _DataSet, name: str, table: dict[str, NDArray[np.float64]]
-) -> list[tuple[Path, float]]:
+def _video_places(data: _DataSet, name: str, table: dict[str, NDArray[np.float64]]) -> list[_Place]:
     """Video and time in it [s] of each row."""
     episodes = np.nan_to_num(table["episode_index"][:, 0], nan=-1.0).astype(int)
     times_s = table["timestamp"][:, 0]

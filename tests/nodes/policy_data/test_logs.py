@@ -241,6 +241,23 @@ def test_a_lerobot_data_set_in_another_unit_of_time_is_not_blamed_on_its_rate(tm
         open_log(folder)
 
 
+@pytest.mark.parametrize("images", ["video", "image"])
+@pytest.mark.parametrize("rows", [[*range(8, 12), *range(8)], [0, 4, 1, 5, 2, 6, 3, 7, *range(8, 12)]])
+def test_rows_of_a_lerobot_data_set_keep_their_images_in_any_order(tmp_path, images, rows):
+    """A table with episode 2 before 0 and 1, and one with rows of 0 and 1 by turns."""
+    folder = write_lerobot_3(tmp_path / "log", images=images)
+    change_table(folder, lambda table: table.take(rows))
+    log = open_log(folder)
+    frames = list(log.frames())
+    numbers = [round(float(frame.image.mean()) / GREY) for frame in frames]
+    assert numbers == (list(range(COUNT)) if images == "video" else rows)
+    assert [frame.steering for frame in frames] == pytest.approx([value(k) for k in numbers])
+    assert log.steering() == pytest.approx([value(k) for k in numbers])
+    assert (np.diff([frame.stamp_ns for frame in frames]) > 0).all()
+    at = [f"{folder}, frame {rows.index(k)}" for k in numbers]
+    assert [frame.place for frame in frames] == at
+
+
 @pytest.mark.parametrize("case", DAMAGED)
 def test_what_is_damaged_is_one_line(tmp_path, case):
     form, damage, said = DAMAGED[case]
