@@ -28,6 +28,7 @@ class LogChoice:
         steering_full_rad: Wheel angle at a recorded steering of 1 [rad], without sign.
         steering_positive: Side to which positive values steer.
         steering_offset_rad: Added to the steering, left positive [rad]: for a camera that looks at the lane from one side.
+        split: Split of a LeRobot data set, or ``all``; None for ``train`` where there are several.
     """
 
     images: str | None = None
@@ -35,6 +36,7 @@ class LogChoice:
     steering_full_rad: float | None = None
     steering_positive: Side | None = None
     steering_offset_rad: float | None = None
+    split: str | None = None
 
     def __post_init__(self) -> None:
         full_rad, positive = self.steering_full_rad, self.steering_positive

@@ -7,6 +7,7 @@ that advnerf exported (``robot_type: advnerf``) also state the side, the poses a
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -42,6 +43,8 @@ _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 _LARGEST = 2**53
 # Exceptions that PyArrow raises for a damaged file beside its own.
 _NONSENSE = (OSError, ValueError, KeyError, IndexError, TypeError, OverflowError, MemoryError)
+_ALL = "all"
+_RANGE = re.compile(r"(\d{1,9}):(\d{1,9})")
 _Place = tuple[Path, float]  # a video and a time in it [s]
 
 
@@ -124,6 +127,11 @@ def read_lerobot(path: Path, choice: LogChoice) -> DriveLog:
     _require_consistent(data, table)
     places = _video_places(data, images, table) if data.features[images]["dtype"] == "video" else []
     rows = _in_video_order(places) if places else list(range(len(table["timestamp"])))
+    total, splits = len(rows), _splits(data)
+    if choice.split is not None or len(splits) > 1:
+        split = chosen_name(choice.split, (*splits, _ALL) if splits else (), "the split", path)
+        rows = _rows_of_split(data, split, rows, table["episode_index"][:, 0])
+    is_part = len(rows) < total
     table = {name: column[rows] for name, column in table.items()}
     count = len(rows)
     values = _values(data, table, steering) if steering else np.full(count, math.nan)
@@ -135,7 +143,9 @@ def read_lerobot(path: Path, choice: LogChoice) -> DriveLog:
 
     def frames() -> Iterator[LogFrame]:
         shown = (
-            _filmed_images(data, [places[row] for row in rows]) if places else _stored_images(data, images)
+            _filmed_images(data, [places[row] for row in rows])
+            if places
+            else _stored_images(data, images, rows)
         )
         for row, rgb in enumerate(shown):
             x_m, y_m, yaw_rad = states[row] if state else NOWHERE
@@ -163,9 +173,15 @@ def read_lerobot(path: Path, choice: LogChoice) -> DriveLog:
         lambda: values,
         frames,
         labels="expert" if state else "recorded",
+        left_out={"of another split": total - len(rows)} if is_part else {},
         attached=lambda: {
             file.name: file.read_bytes() for file in sorted((path / ATTACHED).glob("*")) if file.is_file()
         },
+        notes=(
+            f"frames of the split {split}, of {', '.join(splits)}; the setting split=NAME chooses another, split={_ALL} takes all",
+        )
+        if is_part
+        else (),
     )
 
 
@@ -266,6 +282,32 @@ def _stamps(data: _DataSet, episodes: NDArray[np.float64], rows: Sequence[int]) 
         ) from error
 
 
+def _splits(data: _DataSet) -> tuple[str, ...]:
+    """Names of the splits, ``train`` first."""
+    splits = data.info.get("splits")
+    return tuple(sorted(splits, key=lambda name: name != "train")) if isinstance(splits, dict) else ()
+
+
+def _rows_of_split(
+    data: _DataSet, split: str, rows: Sequence[int], episodes: NDArray[np.float64]
+) -> list[int]:
+    """Those of the rows whose episodes are in a split: what others hold out must not be learned."""
+    if split == _ALL:
+        return list(rows)
+    said = data.info["splits"][split]
+    if not (isinstance(said, str) and (found := _RANGE.fullmatch(said))):
+        raise LogError(
+            f"{data.path / INFO}: splits.{split}: expected episodes such as 0:50, got {said!r:.60}; correct it, or give the setting split={_ALL}"
+        )
+    first, end = int(found[1]), int(found[2])
+    chosen = [row for row in rows if first <= episodes[row] < end]
+    if not chosen:
+        raise LogError(
+            f"{data.path}: expected frames of the split {split}, episodes {said}, got none; give the setting split={_ALL}, or another"
+        )
+    return chosen
+
+
 def _in_video_order(places: Sequence[_Place]) -> list[int]:
     """Numbers of the rows as their videos show them: tables may have the episodes in another order."""
     order = {file: number for number, file in enumerate(dict.fromkeys(file for file, _ in places))}
@@ -277,16 +319,19 @@ def _filmed_images(data: _DataSet, places: Sequence[_Place]) -> Iterator[Rgb]:
         yield from frames_at(file, [time_s for _, time_s in group], 0.5 / data.fps)
 
 
-def _stored_images(data: _DataSet, name: str) -> Iterator[Rgb]:
-    """Images in the tables: each is the content of a file."""
-    for file in data.tables:
-        for number, value in enumerate(_column(file, name)):
-            content = value.get("bytes") if isinstance(value, dict) else None
-            if not isinstance(content, bytes):
-                raise LogError(
-                    f"{file}: expected the image {name} in row {number}, got none; export the data set with its images"
-                )
-            yield decode_stored(content, f"{file}, row {number}")
+def _stored_images(data: _DataSet, name: str, rows: Sequence[int]) -> Iterator[Rgb]:
+    """Images in rows of the tables: each is the content of a file."""
+    kept = set(rows)
+    stored = ((file, *numbered) for file in data.tables for numbered in enumerate(_column(file, name)))
+    for row, (file, number, value) in enumerate(stored):
+        if row not in kept:
+            continue
+        content = value.get("bytes") if isinstance(value, dict) else None
+        if not isinstance(content, bytes):
+            raise LogError(
+                f"{file}: expected the image {name} in row {number}, got none; export the data set with its images"
+            )
+        yield decode_stored(content, f"{file}, row {number}")
 
 
 def _column(file: Path, name: str) -> Iterator[Any]:

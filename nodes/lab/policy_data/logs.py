@@ -80,6 +80,8 @@ def open_log(path: Path, choice: LogChoice | None = None) -> DriveLog:
         AdvnerfError: The format is unknown, or the log is damaged.
     """
     choice = choice or LogChoice()
+    if choice.split is not None and not (path / INFO).is_file():
+        raise LogError(f"split: expected a LeRobot data set, got {path}; leave it out")
     log = _read(path, choice)
     if choice.images is None and len(log.cameras) > 1 and log.images not in OWN_IMAGES:
         note = f"images of {log.images}, the first of {', '.join(log.cameras)}; --images chooses others"

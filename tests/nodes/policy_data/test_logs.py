@@ -258,6 +258,40 @@ def test_rows_of_a_lerobot_data_set_keep_their_images_in_any_order(tmp_path, ima
     assert [frame.place for frame in frames] == at
 
 
+@pytest.mark.parametrize("form", ["lerobot 2", "lerobot 3", "lerobot images"])
+def test_only_the_episodes_of_one_split_of_a_lerobot_data_set_are_taken(tmp_path, form):
+    folder = FORMATS[form](tmp_path / "log")
+    describe(folder, splits={"train": "0:3"})
+    assert (open_log(folder).count, open_log(folder).notes) == (COUNT, ())
+    describe(folder, splits={"val": "1:2", "test": "3:4", "train": "0:1", "odd": "10 %"})
+    for split, numbers in (
+        (None, range(4)),
+        ("train", range(4)),
+        ("val", range(4, 8)),
+        ("all", range(COUNT)),
+    ):
+        log = open_log(folder, LogChoice(split=split))
+        assert greys(log) == pytest.approx(numbers, abs=0.2)
+        assert log.steering() == pytest.approx([value(k) for k in numbers])
+        assert log.count == len(numbers)
+        assert log.left_out == ({"of another split": 8} if log.count == 4 else {})
+        assert [f"split {split or 'train'}, of train, val, test, odd; " in note for note in log.notes] == (
+            [True] if log.left_out else []
+        )
+    for split, said in (
+        ("test", "expected frames of the split test, episodes 3:4, got none"),
+        ("odd", r"info\.json: splits\.odd: expected episodes such as 0:50, got '10 %'"),
+        ("dev", "expected the split dev in .*, it has train, val, test, odd, all"),
+    ):
+        with pytest.raises(LogError, match=said):
+            open_log(folder, LogChoice(split=split))
+
+
+def test_a_split_of_another_format_is_refused(tmp_path):
+    with pytest.raises(LogError, match=r"split: expected a LeRobot data set, got .*tub; leave it out"):
+        open_log(write_tub_2(tmp_path / "tub"), LogChoice(split="val"))
+
+
 @pytest.mark.parametrize("case", DAMAGED)
 def test_what_is_damaged_is_one_line(tmp_path, case):
     form, damage, said = DAMAGED[case]
