@@ -16,6 +16,7 @@ from advnerf_core.data.logs.choice import LogChoice, LogError, Side
 
 Labels = Literal["expert", "recorded"]
 FASTEST_HZ = 1000.0  # no camera is faster; such times have another unit
+LIKELY_HZ = 130.0  # few cameras of cars are faster: such times are more often those of a conversion
 NO_COMMAND = "no command"
 NOWHERE = (math.nan, math.nan, math.nan)
 # Of front wheels: at this angle and above, a value is in degrees, or in another unit.
@@ -172,6 +173,16 @@ class DriveLog:
         digits = ",.0f" if self.rate_hz >= 1000.0 else ".3g"
         return f"{self.rate_hz:{digits}} Hz" + (
             ": times in another unit" if self.rate_hz > FASTEST_HZ else ""
+        )
+
+    @property
+    def times_problem(self) -> str:
+        """Why the times are hardly those of a drive; empty if they may be."""
+        if not LIKELY_HZ < self.rate_hz <= FASTEST_HZ:
+            return ""
+        return (
+            f"images {1e3 / self.rate_hz:.2g} ms apart ({self.rate_in_words}): times that look like those of a conversion, not of a drive; "
+            "policy log export takes the true rate with --rate"
         )
 
     def first_image(self) -> Rgb:

@@ -73,7 +73,7 @@ def write_lerobot(
     Args:
         log: The log; the unit of its steering must be known.
         folder: New folder of the data set.
-        rate_hz: Images per second, about the log's if it has times; None for the log's.
+        rate_hz: Images per second, about the log's if it has likely times; None for the log's.
         report: Called with the number of frames written.
 
     Raises:
@@ -102,7 +102,11 @@ def _rate_of(log: DriveLog, asked_hz: int | None) -> int:
             f"expected times of the images of 0.5 to {FASTEST_HZ:g} Hz in {log.path}, got {log.rate_in_words}; give the images per second with --rate"
         )
     rate_hz = max(round(log.rate_hz), 1) if asked_hz is None else asked_hz
-    if is_known and abs(rate_hz - log.rate_hz) > max(1.0, _RATE_TOLERANCE * log.rate_hz):
+    if (
+        is_known
+        and not log.times_problem
+        and abs(rate_hz - log.rate_hz) > max(1.0, _RATE_TOLERANCE * log.rate_hz)
+    ):
         raise LogError(
             f"--rate: expected about {log.rate_hz:.3g}, the images per second of {log.path}, got {rate_hz}; leave it out: no images are left out "
             "or repeated"

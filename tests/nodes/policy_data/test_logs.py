@@ -389,6 +389,8 @@ def test_records_that_were_deleted_end_an_episode(tmp_path, write, episodes):
     [
         (100, 30, "--rate: expected about 10, the images per second of .*tub, got 30; leave it out"),
         (100, 12, ""),
+        (3, 20, ""),
+        (8, 20, "--rate: expected about 125, the images"),
         (2000, None, ""),
         (None, 5000, "--rate: expected 1 to 1000 images per second, got 5000"),
     ],
@@ -540,6 +542,23 @@ def test_what_is_wrong_with_the_times_of_a_log_is_said(tmp_path, monkeypatch, ca
     assert "expected times of the images of 0.5 to 1000 Hz in " in refused
     assert f"got {said}; give the images per second" in refused
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("step_ms", "is_told"), [(3, True), (7, True), (8, False), (100, False), (0.1, False)]
+)
+def test_times_of_a_conversion_are_told(tmp_path, monkeypatch, capsys, step_ms, is_told):
+    pytest.importorskip("pyarrow")
+    pytest.importorskip("av")
+    tub = f"{write_tub_2(tmp_path / 'tub', step_ms=step_ms)},steering-full-rad=0.4"
+    export = ["log", "export", tub, "--rate", "20", "-o", str(tmp_path / "set")]
+    train = ["train", tub, "--steps", "1", "-o", str(tmp_path / "policy")]
+    for command in (["log", "info", tub], train, *([export] if is_told else [])):
+        assert advnerf(monkeypatch, "policy", *command) == 0
+        shown = " ".join(capsys.readouterr().out.split())
+        assert ("times that look like those of a conversion" in shown) is is_told
+    if is_told:
+        assert open_log(tmp_path / "set").rate_hz == 20
 
 
 def write_timed(folder, column, times):
