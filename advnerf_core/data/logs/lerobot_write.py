@@ -33,6 +33,7 @@ from advnerf_core.files import write_json
 CAMERA = "observation.images.camera"
 _VERSION = "v3.0"
 _TASK = "drive"
+_README = "README.md"
 _FILE = "chunk-000/file-000"
 _GAP_FRAMES = 3.0  # a longer pause between two images starts another episode, as does a step back
 _RATE_TOLERANCE = 0.2
@@ -150,6 +151,7 @@ def _write(log: DriveLog, folder: Path, rate_hz: int, report: Report) -> Exporte
     statistics = {name: _summary(values.astype(np.float64)) for name, values in columns.items()}
     write_json(folder / "meta/stats.json", {**statistics, CAMERA: _image_statistics(sample)})
     _attach(folder / ATTACHED, log.attached())
+    (folder / _README).write_text(_about(log, len(rows), left_out), encoding="utf-8")
     return Exported(len(rows), episodes, rate_hz, log.count - len(rows))
 
 
@@ -330,6 +332,14 @@ def _summary(values: NDArray[np.float64]) -> dict[str, list[Any]]:
         name: getattr(np, f"nan{name}")(values, axis=0).tolist() for name in ("min", "max", "mean", "std")
     }
     return {**numbers, "count": [len(values)]}
+
+
+def _about(log: DriveLog, frames: int, left_out: Mapping[str, int]) -> str:
+    """What a reader of the data set should know: where it comes from, what is left out, and the notes about the log."""
+    said = [f"left out: {count} {why}" for why, count in left_out.items() if count]
+    said += [*log.notes, *([f"unchecked: {log.unchecked}"] if log.unchecked else [])]
+    first = f"{frames} images of {log.images} in {log.path.name}, a {log.format}; exported by advnerf.\n"
+    return "\n".join([first, *(f"- {each}" for each in said), ""])
 
 
 def _attach(folder: Path, files: Mapping[str, bytes]) -> None:

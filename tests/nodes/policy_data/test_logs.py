@@ -403,6 +403,20 @@ def test_an_export_keeps_the_speed_of_the_drive(tmp_path, step_ms, rate_hz, said
     assert (tmp_path / "out").exists() == (not said)
 
 
+def test_an_export_keeps_the_notes_about_its_log(tmp_path):
+    pytest.importorskip("pyarrow")
+    choice = LogChoice(steering_full_rad=0.4)
+    log = open_log(write_tub_2(tmp_path / "tub", step_ms=4, deleted=(2,), piloted=(5, 6)), choice)
+    write_lerobot(log, tmp_path / "out", 20)
+    first, _, *said = (tmp_path / "out/README.md").read_text().splitlines()
+    assert first.startswith("9 images of cam/image_array in tub, a Donkeycar tub, version 2; ")
+    assert said == [
+        "- left out: 1 deleted",
+        "- left out: 2 not driven by the user",
+        f"- {log.notes[0]}",
+    ]
+
+
 def test_what_is_no_log_is_told_apart(tmp_path):
     (tmp_path / "segment").mkdir()
     (tmp_path / "segment" / "video.hevc").write_bytes(b"x")
