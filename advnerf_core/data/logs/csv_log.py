@@ -19,13 +19,22 @@ from advnerf_core.csv_rows import CsvRow, read_csv
 from advnerf_core.data.errors import DatasetError
 from advnerf_core.data.image_files import read_stored
 from advnerf_core.data.logs.choice import LogChoice, LogError
-from advnerf_core.data.logs.drive_log import DriveLog, LogFrame, SteeringUnit, refuse_repeated_images
+from advnerf_core.data.logs.drive_log import (
+    DriveLog,
+    LogFrame,
+    SteeringUnit,
+    chosen_name,
+    refuse_repeated_images,
+)
 from advnerf_core.documents import is_real, raise_problems
 from advnerf_core.errors import ConfigError
 
 UDACITY_FILE = "driving_log.csv"
 _UDACITY = ("center", "left", "right", "steering", "throttle", "brake", "speed")
 _CAMERAS = _UDACITY[:3]
+_CENTER = "center"
+_CAMERA_COLUMN = "frame_id"  # as in the data of Udacity's challenge
+_MOST_CAMERAS = 8  # more names are those of frames
 _FULL_RAD = math.radians(25.0)
 # Such as t, time_ms, Time [s], datetime, stamp, header.timestamp_ns; but not exposure_time, which is a duration.
 _TIMES = re.compile(
@@ -38,23 +47,34 @@ def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
 
     Args:
         path: The file. Its image paths may be relative to it; of absolute ones that do not exist, the end is looked for beside it.
-        choice: Answers of the user: its columns, and the unit of the steering.
+        choice: Answers of the user: its columns, and the unit of the steering. Of rows of several cameras, images is ``COLUMN:CAMERA``;
+            else the center one is taken, or the first.
 
     Raises:
         ConfigError: A row cannot be read; all problems are one error.
-        LogError: Times go back, or an image is missing or there twice.
+        LogError: Times go back, an image is missing or there twice, or the chosen camera is not there or beside the center.
     """
     first = read_csv(path, bare=_UDACITY)[:1]
     is_udacity = any(set(_UDACITY[:4]) <= set(row.values) for row in first)
-    images = choice.images or ("center" if is_udacity else "image")
+    column = choice.images or ("center" if is_udacity else "image")
+    if any(column not in row.values for row in first):
+        column = column.partition(":")[0]
     name = choice.steering or "steering"
     rows = read_csv(
-        path, (images, name), _UDACITY, "name yours with --images and --steering, or correct the header"
+        path, (column, name), _UDACITY, "name yours with --images and --steering, or correct the header"
     )
-    if is_udacity and images in ("left", "right") and choice.steering_offset_rad is None:
+    of_rows = [] if is_udacity else _cameras_of(rows, column)
+    images = column
+    cameras: tuple[str, ...] = _CAMERAS if is_udacity else (column,)
+    if of_rows or choice.images not in (None, column):
+        cameras = tuple(sorted(set(of_rows), key=lambda each: (_CENTER not in each, each))) or (column,)
+        wanted = None if choice.images == column else choice.images
+        images = chosen_name(wanted, cameras, "images", path)
+        rows = [row for row, camera in zip(rows, of_rows, strict=True) if camera == images]
+    if images in cameras[1:] and _CENTER in cameras[0] and choice.steering_offset_rad is None:
         raise LogError(
             f"{path}: the recorded steering belongs to the center camera; for images={images} give what its driver would "
-            "steer in addition with steering-offset-rad (left positive), or use images=center"
+            f"steer in addition with steering-offset-rad (left positive), or use images={cameras[0]}"
         )
     unit = SteeringUnit(name, _FULL_RAD, "right") if is_udacity else SteeringUnit(name)
     unit = unit.chosen(choice)
@@ -69,7 +89,7 @@ def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
         except LogError as error:
             steep.append(str(error))
     raise_problems([*problems, *steep[:1]])  # one setting is the cure of all steep angles
-    files = [_image_file(row, path.parent, images) for row in rows]
+    files = [_image_file(row, path.parent, column) for row in rows]
     refuse_repeated_images(zip((row.place for row in rows), files, strict=True))
 
     def frames() -> Iterator[LogFrame]:
@@ -85,8 +105,8 @@ def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
         "CSV file of Udacity's simulator" if is_udacity else "CSV file",
         (path, *files),
         images,
-        _CAMERAS if is_udacity else (images,),
-        tuple(name for name in (rows[0].values if rows else ()) if name not in (*_CAMERAS, images)),
+        cameras,
+        tuple(name for name in (rows[0].values if rows else ()) if name not in (*_CAMERAS, column)),
         unit,
         len(rows),
         0.0 if _times_repeat(rows) else math.nan,
@@ -94,6 +114,18 @@ def read_csv_log(path: Path, choice: LogChoice) -> DriveLog:
         lambda: np.array(values, np.float64),
         frames,
     )
+
+
+def _cameras_of(rows: Sequence[CsvRow], column: str) -> list[str]:
+    """Camera of each row, as ``COLUMN:CAMERA``, by its ``frame_id`` or else by the folder of its image; none for rows of one camera."""
+    if rows and _CAMERA_COLUMN in rows[0].values:
+        names = [row.values[_CAMERA_COLUMN].strip() for row in rows]
+    else:
+        names = [PureWindowsPath(row.values[column].strip()).parent.name.lower() for row in rows]
+        if not {_CENTER} < set(names) <= set(_CAMERAS):
+            return []
+    several = 1 < len(set(names)) <= min(_MOST_CAMERAS, len(rows) // 2)
+    return [f"{column}:{name}" for name in names] if several else []
 
 
 def _times_repeat(rows: Sequence[CsvRow]) -> bool:

@@ -85,7 +85,7 @@ def open_log(path: Path, choice: LogChoice | None = None) -> DriveLog:
     log = _read(path, choice)
     if log.times_problem:
         log = replace(log, notes=(*log.notes, log.times_problem))
-    if choice.images is None and len(log.cameras) > 1 and log.images not in OWN_IMAGES:
+    if choice.images != log.images and len(log.cameras) > 1 and log.images not in OWN_IMAGES:
         note = f"images of {log.images}, the first of {', '.join(log.cameras)}; --images chooses others"
         return replace(log, notes=(*log.notes, note))
     return log

@@ -114,6 +114,58 @@ def test_a_camera_at_the_side_needs_an_offset(tmp_path):
     assert next(iter(log.frames())).image.max() == 1
 
 
+def write_cameras(folder, frame_ids, folders=("left", "center", "right")):
+    """One row for each time and camera, as ``interpolated.csv`` of Udacity's challenge; the center image is uniform ``GREY * k``."""
+    rows = [f"timestamp,{'frame_id,' if frame_ids else ''}filename,angle"]
+    for k in range(COUNT):
+        for n, camera in enumerate(folders):
+            (folder / camera).mkdir(parents=True, exist_ok=True)
+            shade = GREY * k + (0 if camera == "center" else n + 1)
+            cv2.imwrite(str(folder / camera / f"{k}.png"), np.full((48, 64, 3), shade, np.uint8))
+            named = f"{camera}_camera," if frame_ids else ""
+            rows.append(f"{1000 * k + n},{named}{camera}/{k}.png,{value(k)}")
+    (folder / "interpolated.csv").write_text("\n".join(rows) + "\n")
+    return folder / "interpolated.csv"
+
+
+@pytest.mark.parametrize("ending", ["_camera", ""])
+def test_of_the_rows_of_several_cameras_one_s_are_taken_and_it_is_said(tmp_path, ending):
+    file = write_cameras(tmp_path / "log", bool(ending))
+    column = {"images": "filename", "steering": "angle"}
+    log = open_log(file, LogChoice(**column))
+    cameras = tuple(f"filename:{each}{ending}" for each in ("center", "left", "right"))
+    assert (log.images, log.cameras, log.count) == (cameras[0], cameras, COUNT)
+    assert greys(log) == list(range(COUNT))
+    assert log.steering() == pytest.approx([value(k) for k in range(COUNT)])
+    assert log.notes == (
+        f"images of {cameras[0]}, the first of {', '.join(cameras)}; --images chooses others",
+    )
+    left = column | {"images": cameras[1]}
+    with pytest.raises(
+        LogError, match=rf"for images={cameras[1]} give .*steering-offset-rad.* use images={cameras[0]}"
+    ):
+        open_log(file, LogChoice(**left))
+    side = open_log(file, LogChoice(**left, steering_offset_rad=-0.1))
+    assert (side.count, next(iter(side.frames())).image.max(), side.notes) == (COUNT, 1, ())
+    with pytest.raises(LogError, match=f"expected images filename:rear in .*, it has {', '.join(cameras)}"):
+        open_log(file, LogChoice(**column | {"images": "filename:rear"}))
+
+
+@pytest.mark.parametrize("folders", [("left",), ("center",), ("left", "right"), ("center", "rear")])
+def test_folders_that_are_not_those_of_cameras_are_one_log(tmp_path, folders):
+    """Such as drives to the left and drives to the right."""
+    file = write_cameras(tmp_path / "log", False, folders)
+    log = open_log(file, LogChoice("filename", "angle"))
+    assert (log.images, log.cameras, log.count) == ("filename", ("filename",), len(folders) * COUNT)
+    with pytest.raises(LogError, match=r"expected images filename:center in .*, it has filename; choose"):
+        open_log(file, LogChoice("filename:center", "angle"))
+
+
+def test_numbers_of_frames_are_no_cameras(tmp_path):
+    file = write_timed(tmp_path / "log", "frame_id", range(8))
+    assert (open_log(file).images, open_log(file).count) == ("image", 8)
+
+
 @pytest.mark.parametrize(
     ("form", "needed"),
     [
