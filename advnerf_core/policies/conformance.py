@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import random
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -12,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from advnerf_core.plugins import in_one_line
+from advnerf_core.plugins import FAILURES, in_one_line
 from advnerf_core.policies.adapter import AdaptedPolicy
 from advnerf_core.policies.answer import answer
 from advnerf_core.policies.contract import PolicyContractError
@@ -33,6 +35,8 @@ _SIZE_ADVICE = (
     "set the view's width and height to the size it was trained with, and the output to [B] or [B, 1]"
 )
 _PROBES = 4
+# Pictures of patches of one colour, rows by columns: a policy that looks for something finds it there rather than in noise.
+_PATCHES = (6, 8)
 _MODES = (nn.modules.dropout._DropoutNd, nn.modules.batchnorm._BatchNorm)
 
 
@@ -88,6 +92,58 @@ def check_policy(
     elif steering_rad is not None and np.ptp(examined.steering(images)) > _CONSTANT_RAD:
         findings[-1] = _expert(examined, images, steering_rad)
     return findings
+
+
+def require_steady(policy: AdaptedPolicy, name: str) -> None:
+    """Refuse a policy whose answer to a picture is random, or depends on earlier pictures or on the rest of a batch.
+
+    It takes five batches and four single pictures, or three pictures of a policy that queries another program. Global random numbers go on as
+    if nothing had been asked. A policy that fails at these pictures passes: its drive tells why.
+
+    Raises:
+        PolicyContractError: It answers the same picture in different ways.
+    """
+    examined = _Examined(policy, None)
+    images = _patches(2, policy.contract.size)
+    looks = (_asked_again,) if policy.identity else (_repeatable, _independent)
+    for look in looks:
+        try:
+            with _seeded(0):
+                finding = look(examined, images)
+        except FAILURES:
+            return
+        if finding.verdict == FAILURE:
+            raise PolicyContractError(
+                f"{name}: expected a policy that answers a picture always the same: {finding.text}"
+            )
+
+
+def _patches(count: int, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Pictures ``[count, H, W, 3]`` of random patches."""
+    rows, columns = (
+        np.arange(pixels) * patches // pixels for pixels, patches in zip(size, _PATCHES, strict=True)
+    )
+    patches = np.random.default_rng(0).integers(0, 256, (count, *_PATCHES, 3), np.uint8)
+    return patches[:, rows][:, :, columns]
+
+
+@contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """Global random numbers of torch, NumPy and Python from a seed; afterwards they go on as before."""
+    devices = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
+    of_numpy, of_python = np.random.get_state(), random.getstate()  # noqa: NPY002 (the global one is what code of others uses)
+    with torch.random.fork_rng(devices=devices):
+        # Not torch.manual_seed: it would also seed a GPU that is used later, for the rest of the process.
+        torch.default_generator.manual_seed(seed)
+        if devices:
+            torch.cuda.manual_seed_all(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        random.seed(seed)
+        try:
+            yield
+        finally:
+            np.random.set_state(of_numpy)  # noqa: NPY002
+            random.setstate(of_python)
 
 
 class _Examined:
@@ -222,8 +278,7 @@ def _repeatable(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
     first, other = images[:_PROBES], images[-_PROBES:][::-1]
 
     def seeded(batch: NDArray[np.uint8], seed: int) -> Array:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+        with _seeded(seed):
             return examined.steering(batch)
 
     before = seeded(first, 0)
@@ -233,14 +288,27 @@ def _repeatable(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
     tolerance = _tolerance(before)
     if np.abs(after - before).max() > tolerance or np.abs(seed_again - reseeded).max() > tolerance:
         text = (
-            "declared stateless, but the output depends on the images before; declare stateless = False and hand the memory "
+            "declared stateless, but the output depends on the images before, or on a random generator of its own; declare stateless = False and hand the memory "
             "through forward(images, goals, memory), or clear it on every call"
         )
         if not examined.policy.stateless:
-            text = "keeps a memory of its own besides the one it is handed; put everything into the memory that forward returns"
+            text = "keeps a memory or a random generator of its own besides the memory it is handed; put everything into the memory that forward returns"
         return Finding("repeatable", FAILURE, text)
     if np.abs(reseeded - before).max() > tolerance:
         text = "the output is random: dropout or noise is left on; call .eval(), and give functional dropout training=self.training"
+        return Finding("repeatable", FAILURE, text)
+    return Finding("repeatable", OK, "the same image gives the same steering")
+
+
+def _asked_again(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
+    """The same of another program, which no seed of ours reaches, with few questions."""
+    before = examined.steering(images[:1])
+    examined.steering(255 - images[:1])
+    if np.abs(examined.steering(images[:1]) - before).max() > _tolerance(before):
+        text = (
+            f"{examined.policy.identity} answers a picture otherwise when it is asked again: it draws lots, or remembers an earlier drive; "
+            "seed it, and clear its memory at the start of a drive"
+        )
         return Finding("repeatable", FAILURE, text)
     return Finding("repeatable", OK, "the same image gives the same steering")
 

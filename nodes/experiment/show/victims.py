@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.files import write_json
-from advnerf_core.policies.adapter import adapted
+from advnerf_core.policies.adapter import AdaptedPolicy, adapted
+from advnerf_core.policies.conformance import require_steady
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.load import is_address, is_code, load_any_policy, source_sha256
 from advnerf_core.policies.policy_file import LoadedPolicy
@@ -18,12 +19,12 @@ from nodes.runtime.errors import ConfigError
 
 
 def look_at_given(experiment: Experiment) -> None:
-    """Load the existing policies and store their declarations; unchanged files are not loaded again.
+    """Load the existing policies, refuse unsteady ones, and store their declarations; unchanged files are not loaded again.
 
     Their view is compared with the world's camera, so that a world which must be open for its description is opened.
 
     Raises:
-        AdvnerfError: A policy cannot be loaded.
+        AdvnerfError: A policy cannot be loaded, or answers the same picture in different ways.
         ConfigError: The policies have different views.
     """
     wanted, known = given_in(experiment.config), read_kept(experiment.folder)
@@ -49,7 +50,10 @@ def _look_at(experiment: Experiment, spec: str, known: GivenPolicy | None) -> Gi
     if known is not None and not is_code(spec) and (known.policy, known.source_sha256) == (spec, source):
         return known
     loaded = _driver_at(experiment, spec) if is_address(spec) else load_any_policy(spec)
-    # A network that was trained here has no other declaration.
+    # Of a network that was trained here, code and mode are known.
+    if isinstance(loaded.policy, AdaptedPolicy) and (known is None or known.sha256 != loaded.sha256):
+        require_steady(loaded.policy, spec)
+    # It has no other declaration either.
     plain = PolicyContract(loaded.view, goal_size=loaded.policy.goal_size)
     contract = adapted(loaded.policy, plain).contract
     return GivenPolicy(

@@ -1,3 +1,4 @@
+import random
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +8,8 @@ from torch import nn
 
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.adapter import adapt
-from advnerf_core.policies.conformance import FAILURE, OK, check_policy
-from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.conformance import FAILURE, OK, check_policy, require_steady
+from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.frames import FrameStack
 from advnerf_core.policies.tracker import TrackedTrajectory
 from advnerf_core.policies.view import PolicyView
@@ -292,3 +293,97 @@ def test_waypoints_and_stacks_are_checked_too():
     )
     wrong = replace(contract, frames=FrameStack(count=3, axis="channels"))
     assert findings(Sees().eval(), wrong)["input"].verdict == FAILURE
+
+
+class Carrying(nn.Module):
+    """A declared memory: half of what was steered before."""
+
+    def initial_memory(self, batch):
+        return torch.zeros(batch, 1)
+
+    def forward(self, images, goals, memory):
+        memory = 0.5 * memory + 0.5 * Seer()(images)[:, None]
+        return memory[:, 0], memory
+
+
+class Asked:
+    """Another program, asked through a network; it counts pictures, and draws lots if it is told to."""
+
+    training = False
+    identity = "their driver 1.2"
+
+    def __init__(self, noise=0.0):
+        self.pictures, self.noise = 0, np.random.default_rng(0) if noise else None
+
+    def __call__(self, images):
+        self.pictures += len(images)
+        return Seer()(images) + (0.0 if self.noise is None else float(self.noise.normal()))
+
+
+UNSTEADY = [
+    (lambda: Dropping(always=True).eval(), "the output is random"),
+    (
+        lambda: around(after=lambda y: y + torch.from_numpy(np.random.normal(size=len(y)))),  # noqa: NPY002
+        "the output is random",
+    ),
+    (lambda: around(after=lambda y: y + random.random()), "the output is random"),
+    (lambda: around(after=lambda y: 0 * y + torch.randn(len(y))), "the output is random"),
+    (lambda: Remembering().eval(), "the output depends on the images before"),
+    (lambda: around(lambda x: x - x.mean(0, keepdim=True)), "differently in a batch than alone"),
+    (lambda: Asked(noise=1.0), "their driver 1.2 answers a picture otherwise"),
+]
+
+
+@pytest.mark.parametrize(("made", "sentence"), UNSTEADY)
+def test_an_unsteady_policy_is_refused_before_it_is_attacked(made, sentence):
+    with pytest.raises(
+        PolicyContractError, match=r"^mine:it: expected a policy that answers a picture"
+    ) as told:
+        require_steady(adapt(made(), DECLARED), "mine:it")
+    assert sentence in str(told.value)
+
+
+@pytest.mark.parametrize("made", [made for made, _ in UNSTEADY[:6]])
+def test_the_check_of_a_policy_says_the_same(made):
+    with pytest.raises(PolicyContractError) as told:
+        require_steady(adapt(made(), DECLARED), "mine")
+    found = next(f for f in findings(made()).values() if f.verdict == FAILURE)
+    assert found.text.partition("(")[0] in str(told.value)
+
+
+def unimportant_bits(images):
+    """Its last bits depend on the batch, as those of other kernels do."""
+    return Seer()(images) * (1.0 + 1e-6 * len(images))
+
+
+def test_a_steady_policy_passes_and_no_random_number_is_spent():
+    def numbers():
+        return float(torch.rand(())), float(np.random.random()), random.random()  # noqa: NPY002
+
+    def seed():
+        torch.manual_seed(1)
+        np.random.seed(1)  # noqa: NPY002
+        random.seed(1)
+
+    seed()
+    expected = numbers()
+    stack = replace(DECLARED, frames=FrameStack(count=2))
+    steady = [
+        adapt(around(), DECLARED),
+        adapt(Carrying().eval(), replace(DECLARED, stateless=False)),
+        adapt(around(lambda x: 0.5 * x[:, :3] + 0.5 * x[:, 3:]), stack),
+        adapt(unimportant_bits, DECLARED),
+        # Nothing in it is random; a draw that nobody uses is still a draw.
+        adapt(around(after=lambda y: y + 0 * torch.randn(len(y))), DECLARED),
+    ]
+    for policy in steady:
+        seed()
+        require_steady(policy, "mine")
+        assert numbers() == expected
+    assert steady[0](torch.ones(1, 3, 22, 40)) == adapt(around(), DECLARED)(torch.ones(1, 3, 22, 40))
+
+
+def test_another_program_is_asked_three_pictures():
+    program = Asked()
+    require_steady(adapt(program, DECLARED), "mine")
+    assert program.pictures == 3

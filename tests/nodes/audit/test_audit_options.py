@@ -117,6 +117,30 @@ def test_a_world_is_not_opened_for_what_a_policy_and_the_path_declare(openings: 
     assert not openings.read_text()
 
 
+def test_a_random_policy_is_refused_before_its_place_is_learned(tmp_path: Path) -> None:
+    """Its learned place was blamed, after minutes."""
+    (tmp_path / "lots.py").write_text(
+        "import torch\nfrom advnerf_core import PolicyContract, PolicyView, adapt\n"
+        "from hardware.worlds.lab.config import LabConfig\n\n"
+        "class Blind(torch.nn.Module):\n"
+        "    def forward(self, images):\n        return 0.1 * torch.randn(len(images)) + 0 * images.mean((1, 2, 3))\n\n"
+        "def factory():\n"
+        "    view = PolicyView(LabConfig().camera.pinhole, width=80, height=40)\n"
+        "    return adapt(Blind().eval(), PolicyContract(view))\n"
+    )
+    asked = ["lots:factory", "--world", "lab", "--limit", "0.4", "--budget", "1m", "-o", "audit"]
+    command = [sys.executable, "-m", "nodes.cli", "audit", *asked]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    found = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert (found.returncode, "lots:factory: expected a policy that" in found.stderr) == (64, True), (
+        found.stderr
+    )
+    assert "capture" not in found.stdout + found.stderr
+    assert not list((tmp_path / "audit").rglob("capture"))
+
+
 def test_a_network_with_weights_in_another_file_is_copied_with_them(tmp_path: Path) -> None:
     """As torch exports it by default; nothing but the file's content says how it steers."""
     onnx_models = pytest.importorskip("tests.support.onnx_models")

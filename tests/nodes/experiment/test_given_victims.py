@@ -368,6 +368,34 @@ def test_other_weights_that_a_factory_reads_are_another_policy(folder: Path, tmp
     assert hashes[0] == hashes[1] != hashes[2]
 
 
+UNSTEADY = {
+    "drops": ("torch.nn.functional.dropout(images, 0.5, training=True)", "the output is random"),
+    "mixes": ("images - images.mean(0, keepdim=True)", "an image steers differently in a batch than alone"),
+}
+
+
+@pytest.mark.parametrize("name", UNSTEADY)
+def test_a_policy_that_answers_a_picture_in_different_ways_is_refused_before_anything_is_run(
+    folder: Path, tmp_path: Path, name: str
+) -> None:
+    """Its prediction would be the noise of its drives."""
+    done, sentence = UNSTEADY[name]
+    first = f"class First(torch.nn.Module):\n    def forward(self, images):\n        return {done}\n"
+    text = MODULE.replace("def factory", f"{first}\ndef factory").replace(
+        "Sequential(*", "Sequential(First(), *"
+    )
+    (folder / f"unsteady_{name}.py").write_text(text)
+    change = f"victims={{module: {{policy: 'unsteady_{name}:factory'}}}}"
+    try:
+        experiment = load_experiment(folder / "mine.experiment.yaml", "tiny", (change,), tmp_path / "run")
+        with pytest.raises(AdvnerfError, match=f"unsteady_{name}:factory: expected a policy.*{sentence}"):
+            run_experiment(experiment)
+    finally:
+        (folder / f"unsteady_{name}.py").unlink()
+    assert not experiment.stage_folder("capture").exists()
+    assert not (experiment.folder / "victims.json").exists()
+
+
 @pytest.mark.parametrize("changed_first", [False, True])
 def test_another_policy_under_the_same_name_is_another_cell(
     folder: Path, tmp_path: Path, changed_first: bool
