@@ -7,7 +7,7 @@ with ``--seed``.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,28 +43,32 @@ def rows_of(seeds: Sequence[dict[str, Any]]) -> list[Row]:
         )
         ratios = [drive["ratio"] for drive in drives]
         line = f"retrained once, under the old attack, {name}, over the original undisturbed"
-        note = (
-            f"each seed: {_each(ratios, 3)}; one start that nothing has seen, deployed: {'; '.join(totals)}"
-        )
+        note = f"seeds in turn: {_each(ratios, 3)}; one start that nothing has seen, deployed: {'; '.join(totals)}"
         rows.append(
             (line, float(np.mean(ratios)), "x", f"<= {_TARGET} x", bool(np.mean(ratios) <= _TARGET), note)
         )
     for number in range(max(len(each["rounds"]) for each in seeds)):
-        rows += _round_rows(number, [each for each in seeds if number < len(each["rounds"])])
+        rows += _round_rows(
+            number, {seed: each for seed, each in enumerate(seeds) if number < len(each["rounds"])}
+        )
     return rows
 
 
-def _round_rows(number: int, seeds: Sequence[dict[str, Any]]) -> list[Row]:
-    rounds, rows = [each["rounds"][number] for each in seeds], list[Row]()
+def _round_rows(number: int, seeds: Mapping[int, dict[str, Any]]) -> list[Row]:
+    rounds, rows = [each["rounds"][number] for each in seeds.values()], list[Row]()
     paying = sum(
-        max(each["surrogate"].values()) > seed["pays_m"] for each, seed in zip(rounds, seeds, strict=True)
+        max(each["surrogate"].values()) > seed["pays_m"]
+        for each, seed in zip(rounds, seeds.values(), strict=True)
     )
+    pays_m = next(iter(seeds.values()))["pays_m"]
     for name in rounds[0]["surrogate"]:
-        deployed_m = [each["deployed"][name] for each in rounds]
+        deployed_m, learned_m = (
+            [each[domain][name] for each in rounds] for domain in ("deployed", "surrogate")
+        )
         note = (
-            f"each seed: {_each(deployed_m, 3)} m; in the learned scene {_each([each['surrogate'][name] for each in rounds], 3)} m; gradient, victims "
-            f"{', '.join(each['victim'][:12] for each in rounds)}; an attack pays on {paying} of {len(seeds)}: above {seeds[0]['pays_m']:g} m per tick in "
-            "the learned scene, on any path"
+            f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}: {_each(deployed_m, 3)} m; in the learned scene {_each(learned_m, 3)} m; "
+            f"gradient, victims {', '.join(each['victim'][:12] for each in rounds)}; an attack pays on {paying} of {len(seeds)}: above {pays_m:g} m per "
+            "tick in the learned scene, on any path"
         )
         line = (
             f"attack on the policy after {number} round{'s' * (number != 1)} of retraining, {name}, deployed"
@@ -78,14 +82,13 @@ def _each(values: Sequence[float], digits: int) -> str:
 
 
 def publish(found: Path, original: Path, docs: Path) -> None:
-    """The rounds, the attacked policies and the curve of the first seed into the documentation."""
+    """The rounds and the attacked policies of the first seed into the documentation."""
     text, kept = (found / "retrain.json").read_text(), docs / "results" / "retrain"
     summary = read_json(found / "retrain.json")
     write_atomically(kept / "retrain.json", text)
     for number in range(len(summary["rounds"])):
         file = found / f"round{number - 1}" / "policy.safetensors" if number else original
         write_atomically(kept / f"policy_{number}.safetensors", file.read_bytes())
-    retrain_plot.draw(docs / "retraining.png", summary["rounds"], summary["pays_m"])
 
 
 def main() -> None:
@@ -105,7 +108,10 @@ def main() -> None:
     else:
         original = Path(victim_spec(experiment, experiment.config.main_victim))
         publish(found, original, REPOSITORY / "docs")
-    for line, value, unit, target, met, note in rows_of(kept_summaries()):
+    seeds = kept_summaries()
+    longest = max(seeds, key=lambda each: len(each["rounds"]))
+    retrain_plot.draw(REPOSITORY / "docs" / "retraining.png", longest["rounds"], longest["pays_m"])
+    for line, value, unit, target, met, note in rows_of(seeds):
         print(f"{line}: {value:.2f} {unit} (target {target or '-'}): {met}")
         record_row(line, value, unit, target, met, COMMAND, note)
 

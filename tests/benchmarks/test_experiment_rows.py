@@ -42,16 +42,18 @@ def test_retrained_policies_are_held_against_the_originals_undisturbed():
     both = {line: (value, met, note) for line, value, _, _, met, note in retraining.rows_of([first, second])}
     ratio, met, note = both["retrained once, under the old attack, left, over the original undisturbed"]
     assert (ratio, met) == (pytest.approx(1.06), True)
-    assert "each seed: 1.110, 1.010" in note
+    assert "seeds in turn: 1.110, 1.010" in note
     value, _, note = both["attack on the policy after 0 rounds of retraining, right, deployed"]
     assert value == pytest.approx(3.0)
+    assert "seeds 0, 1: 4.000, 2.000 m" in note
     assert "an attack pays on 1 of 2" in note
     value, _, note = both["attack on the policy after 1 round of retraining, right, deployed"]
     assert value == 0.2  # of the seed that came so far
+    assert note.startswith("seed 1: 0.200 m")
     assert "victims bbbbbbbbbbbb; an attack pays on 0 of 1" in note
 
 
-def test_rounds_and_their_curve_are_published_as_they_were_found(tmp_path):
+def test_rounds_are_published_as_they_were_found(tmp_path):
     rounds = [{"victim": "a" * 64, "surrogate": {"right": 5.0}, "deployed": {"right": 4.0}}]
     (tmp_path / "found").mkdir()
     (tmp_path / "found" / "retrain.json").write_text(json.dumps({"rounds": rounds, "pays_m": 0.175}))
@@ -60,7 +62,6 @@ def test_rounds_and_their_curve_are_published_as_they_were_found(tmp_path):
     assert (tmp_path / "docs" / "results" / "retrain" / "policy_0.safetensors").read_bytes() == b"weights"
     kept = tmp_path / "docs" / "results" / "retrain" / "retrain.json"
     assert json.loads(kept.read_text())["rounds"] == rounds
-    assert (tmp_path / "docs" / "retraining.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_shares_of_the_white_box_are_of_what_it_adds(tmp_path):
