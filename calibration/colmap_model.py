@@ -184,6 +184,11 @@ def _array(points: Sequence[NDArray[np.float64]]) -> Array:
 def _require_enough(model: Model, names: Sequence[str], config: SfmConfig) -> None:
     needed = max(MIN_IMAGES, int(np.ceil(config.min_registered_share * len(names))))
     if len(model.images) >= needed:
+        if not len(model.points):
+            raise ReconstructionError(
+                f"expected points that several of the {len(model.images)} images see from different places, got none: their poses are invented; "
+                "move the camera between photographs instead of only turning it"
+            )
         return
     shown = "; ".join(f"{image.name}: {image.why}" for image in model.left_out[:_SHOWN_NAMES])
     more = "; ..." if len(model.left_out) > _SHOWN_NAMES else ""

@@ -35,6 +35,7 @@ _HELD_OUT = 0.3
 _MOST_RMSE = 0.03
 # A colour is wrong if it is farther off than this, and the others fit better by this factor without it.
 _ONE_WRONG, _MUCH_BETTER = 0.04, 2.5
+_CHANNELS = ("red", "green", "blue")
 # A larger change of repeated colours while measuring is refused.
 _MOST_DRIFT = 0.03
 
@@ -191,7 +192,25 @@ def fit_display(
             f"expected held-out colours within {100 * _MOST_RMSE:.1f} %, got {100 * fit.rmse(True):.1f} %: are exposure and white balance locked, "
             "night light, dynamic contrast and local dimming off, and was every colour shown long enough?"
         )
+    _refuse_exchanged(fit)
     return fit
+
+
+def _refuse_exchanged(fit: DisplayFit) -> None:
+    """Refuse pictures whose channels are in another order than those of the shown colours.
+
+    Raises:
+        PoorFitError: Each channel of the camera sees another one of the display most.
+    """
+    sees = [int(channel) for channel in np.abs(fit.model.mixing).argmax(axis=1)]
+    if sorted(sees) == [0, 1, 2] != sees:
+        pairs = ", ".join(
+            f"{_CHANNELS[shown]} as {_CHANNELS[seen]}" for seen, shown in enumerate(sees) if seen != shown
+        )
+        raise PoorFitError(
+            f"expected pictures in which each shown colour is seen as itself, got {pairs}: save the pictures as RGB, not BGR, and show the colours of "
+            "this sequence"
+        )
 
 
 def _refuse_one_wrong(fit: DisplayFit, inks: bool) -> None:

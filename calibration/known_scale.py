@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from advnerf_core.aruco import marker_dictionary
 from advnerf_core.data.similarity import Similarity, fit_positions
 from advnerf_core.geometry import Array, Pinhole, invert_transform
-from calibration.photo_model import Model, ReconstructionError
+from calibration.photo_model import Model, ReconstructionError, Registered
 from calibration.world_axes import Ground, cameras_up
 
 # An undistorted image ``[H, W, 3]`` with its pinhole and ``T_world_from_camera``.
@@ -55,8 +55,13 @@ def length_scale(
     return length_m / distance
 
 
+def _of_name(model: Model, name: str) -> list[Registered]:
+    """Images of a name, which may lack its first folders."""
+    return [each for each in model.images if each.name == name or each.name.endswith(f"/{name}")]
+
+
 def _end(model: Model, points_by_id: Mapping[int, Array], name: str) -> Array:
-    images = [each for each in model.images if each.name == name or each.name.endswith(f"/{name}")]
+    images = _of_name(model, name)
     if len(images) == 1:
         return np.asarray(images[0].T_world_from_camera[:3, 3])
     if name.isdigit() and int(name) in points_by_id:
@@ -98,15 +103,15 @@ def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: 
         ReconstructionError: The positions do not fit the model.
         SimilarityError: They do not fix scale and direction.
     """
-    named = {each.name: each for each in model.images}
-    images = [named[name] for name in positions_m if name in named]
+    placed = [(found[0], name) for name in positions_m if len(found := _of_name(model, name)) == 1]
+    images = [image for image, _ in placed]
     if len(images) < 2:
         raise ReconstructionError(
             f"expected positions of at least 2 of the model's images, got {len(images)}; "
             f"write the names as COLMAP does: {', '.join(each.name for each in model.images[:_SHOWN])}"
         )
     source = np.stack([each.T_world_from_camera[:3, 3] for each in images])
-    target = np.stack([np.asarray(positions_m[each.name], np.float64) for each in images])
+    target = np.stack([np.asarray(positions_m[name], np.float64) for _, name in placed])
     up = cameras_up(model.poses) if ground is None else ground.up
     similarity, on_line = fit_positions(source, target, up)
     errors = np.linalg.norm(similarity.points(source) - target, axis=1)

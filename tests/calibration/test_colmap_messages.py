@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -5,6 +7,7 @@ from advnerf_core.data.lens import Lens
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
 from calibration import colmap_messages as messages
+from calibration.colmap_model import _require_enough
 from calibration.photo_model import (
     FoundCamera,
     LeftOut,
@@ -58,6 +61,15 @@ def test_a_model_arrives_to_the_bit():
         2,
         0.31,
     )
+
+
+def test_a_model_without_a_point_has_invented_poses():
+    """As of a camera that was only turned: all images have poses, and a reprojection error of 0."""
+    images = tuple(Registered(f"{k}.jpg", "phone", np.eye(4), PINHOLE, LENS) for k in range(28))
+    model = Model(images, (), np.zeros((0, 3)), 0.0, 1)
+    with pytest.raises(ReconstructionError, match="got none: their poses are invented; move the camera"):
+        _require_enough(model, [each.name for each in images], SfmConfig())
+    _require_enough(dataclasses.replace(model, points=np.ones((50, 3))), [], SfmConfig())
 
 
 def test_progress_and_errors_arrive():

@@ -79,6 +79,11 @@ def test_saturated_sets_are_refused():
         fit_display(SHOWN, 0.01 * monitor(SHOWN))
 
 
+def test_pictures_with_red_and_blue_exchanged_are_refused():
+    with pytest.raises(PoorFitError, match="got blue as red, red as blue: save the pictures as RGB, not BGR"):
+        fit_display(SHOWN, monitor(SHOWN)[:, ::-1])
+
+
 def test_greys_only_a_drift_too_few_and_another_screen_are_refused():
     rng = np.random.default_rng(4)
     grey = np.repeat(np.linspace(0.0, 1.0, 80)[:, None], 3, axis=1)

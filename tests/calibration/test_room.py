@@ -34,6 +34,12 @@ def area(polygon):
         ((0.6, np.inf), (0, 0, 0), "monitor", "finite numbers"),
         ((0.6, 0.3), (0, np.nan, 0), "monitor", "finite numbers"),
         ((0.6, 0.3), (0, 0, 0), "", "subject"),
+        (
+            (0.6, 0.3),
+            (20, 0, 100),
+            "monitor",
+            "within 20 m of its subject's origin, got 102.0 m; is a length, .* in cm or mm",
+        ),
     ],
 )
 def test_a_face_that_cannot_be_is_an_error_of_ours(size_m, centre_m, subject, message):
@@ -56,6 +62,9 @@ def test_a_walked_fence_lies_a_margin_inside():
     assert area(fence) == pytest.approx(7.0**2, rel=0.02)
     assert np.abs(np.array(fence)).max() == pytest.approx(3.5, abs=0.03)
     assert clearance(SQUARE, fence) == pytest.approx(1.5, abs=0.03)
+    # A second lap changes next to nothing, where it had emptied the first.
+    twice = fence_from_trace(walk(np.concatenate([corners, 1.005 * corners])), 0.3)
+    assert area(twice) == pytest.approx(7.0**2, rel=0.02)
     # A room that is not convex keeps its notch.
     notched = np.array([[-3, -3], [3, -3], [3, 0], [0, 0], [0, 3], [-3, 3]], float)
     assert area(fence_from_trace(walk(notched), 0.0)) == pytest.approx(27.0, rel=0.02)

@@ -201,10 +201,10 @@ def test_a_preset_sets_how_to_train(pictures: Path, changes: dict[str, bool], op
 
 def test_alpha_that_is_opaque_everywhere_is_none(pictures: Path) -> None:
     images = load_transforms(pictures).load()
-    assert scene_training._transparent(images)
+    assert images.transparent
     assert images.alpha is not None
     opaque = dataclasses.replace(images, alpha=np.full_like(images.alpha, 255))
-    assert not scene_training._transparent(opaque)
+    assert not opaque.transparent
 
 
 def test_help_says_what_presets_are_for(

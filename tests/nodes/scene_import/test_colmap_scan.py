@@ -134,8 +134,8 @@ def test_a_length_between_two_points_gives_metres(tmp_path, ring):
     assert_true_sizes(loaded(tmp_path)[0], 1e-9)
 
 
-def write_positions(file, poses):
-    rows = [f"{name},{','.join(map(str, T[:3, 3]))}" for name, T in zip(NAMES, poses, strict=True)]
+def write_positions(file, poses, names=NAMES):
+    rows = [f"{name},{','.join(map(str, T[:3, 3]))}" for name, T in zip(names, poses, strict=True)]
     file.write_text("\n".join(["image,x_m,y_m,z_m", *rows]) + "\n")
     return file
 
@@ -147,6 +147,16 @@ def test_known_positions_give_metres_and_the_world(tmp_path, ring):
         np.testing.assert_allclose(frames[name].T_world_from_camera, T, atol=1e-3)
     assert report["up"] == "that of the known positions"
     assert not report["ground_at_zero"]
+
+
+def test_known_positions_may_leave_out_the_folders_of_images_as_a_length_may(tmp_path):
+    names = [f"walk/{number}.png" for number in range(8)]
+    scan = write(posed([in_colmap(T) for T in RING], names, floor()), tmp_path / "model")
+    known = write_positions(tmp_path / "gps.csv", RING, [f"{number}.png" for number in range(8)])
+    run(tmp_path, scan, write_images(tmp_path / "pictures", names), positions=known)
+    frames, _ = loaded(tmp_path)
+    for name, T in zip(names, RING, strict=True):
+        np.testing.assert_allclose(frames[name].T_world_from_camera, T, atol=1e-3)
 
 
 @pytest.mark.parametrize("with_floor", [True, False])
