@@ -29,6 +29,8 @@ _LEAST_LENGTH_M, _MOST_LENGTH_M = 1.0, 500.0
 _MOST_PIECES = 80  # more take hours to fit, and no track of tape has them
 # No pose in between: a car at 2 m/s is measured every 0.2 m at 10 Hz.
 _MOST_JUMP_M = 0.5
+# A car this far from the floor's level was lifted; less may be a tilted frame. Levels of the floor are told apart to half of it [m].
+_LIFTED_M, _LEVEL_M = 0.15, 0.1
 _CLOSING_WEIGHT = 100.0
 _POINTS = 600
 # Distance from its start at which a loop counts as closed [m].
@@ -139,6 +141,24 @@ def require_a_way(xy: Array, closed: bool = False) -> None:
         raise DegenerateDataError(
             f"expected a trace of at most {_MOST_LENGTH_M:g} m, got {length_m:.4g} m: are its positions in m? Drive a loop once or twice"
         )
+
+
+def driven_part(positions_m: ArrayLike) -> slice:
+    """The part of a recorded lap in which the car stood on the floor; before and after it, the car was carried.
+
+    The floor is where it moved furthest, and the longest way there is the part.
+
+    Args:
+        positions_m: Positions in the order of time ``[N, 3]`` [m].
+    """
+    points = np.asarray(positions_m, np.float64)
+    steps_m = np.linalg.norm(np.diff(points[:, :2], axis=0, prepend=points[:1, :2]), axis=1)
+    levels, which = np.unique(np.round(points[:, 2] / _LEVEL_M), return_inverse=True)
+    level_m = _LEVEL_M * levels[np.bincount(which, steps_m).argmax()]
+    on_floor = np.abs(points[:, 2] - level_m) <= _LIFTED_M
+    edges = np.flatnonzero(np.diff(np.pad(on_floor, 1).astype(int))).reshape(-1, 2)
+    first, end = max(edges, key=lambda part: steps_m[part[0] : part[1]].sum())
+    return slice(int(first), int(end))
 
 
 def require_forward(xy: Array, yaw_rad: Array) -> None:

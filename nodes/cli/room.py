@@ -255,14 +255,20 @@ def room_place(
 
 
 def _way(bag: Path, topic: str) -> Array:
-    """A trace whose direction is the path's; that of the car is checked by its heading."""
+    """A trace whose direction is the path's; that of the car is checked by its heading, and where it was carried is left out."""
     import numpy as np
 
-    from calibration.path_fit import require_forward
+    from calibration.path_fit import driven_part, require_forward
     from nodes.lab.wizards.bags import CAR, read_poses
 
     T = read_poses(bag, topic).T
     if topic == CAR:
+        recorded = len(T)
+        T = T[driven_part(T[:, :3, 3])]
+        if len(T) < recorded:
+            print(
+                f"{recorded - len(T)} of {recorded} poses are left out: the car was carried, or lifted, then"
+            )
         require_forward(T[:, :2, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0]))
     return T[:, :2, 3]
 

@@ -5,7 +5,7 @@ from advnerf_core.driving.path import Arc, Line, Path
 from advnerf_core.strict import within_a_turn
 from calibration import path_fit
 from calibration.degeneracy import DegenerateDataError
-from calibration.path_fit import fit_path, require_forward
+from calibration.path_fit import driven_part, fit_path, require_forward
 
 SQUARE = Path.rounded_square(4.0, 1.1)
 
@@ -58,6 +58,22 @@ def test_a_car_that_was_pulled_backwards_gives_no_path():
     require_forward(poses[:, :2], poses[:, 2] + 1.2)  # a subject that is turned, or a car that drifts
     with pytest.raises(DegenerateDataError, match="nose points against its way on 100 % of it"):
         require_forward(poses[::-1, :2], poses[::-1, 2])
+
+
+def test_a_car_that_was_carried_to_the_lap_and_away_is_measured_where_it_drove():
+    """It stood on a desk for a minute first; the way through the air was fitted as a part of the path."""
+    rng = np.random.default_rng(0)
+    angle = np.linspace(0.0, 2.3 * np.pi, 900)
+    lap = np.stack(
+        [2.0 * np.sin(angle), -2.0 * np.cos(angle), 0.01 * np.sin(angle)], axis=1
+    )  # a tilted frame
+    desk = np.tile([-4.0, -2.6, 0.7], (6000, 1))
+    there = np.linspace([-4.0, -2.6, 0.6], [0.0, -2.0, 0.6], 200)
+    away = np.linspace([*lap[-1, :2], 0.6], [-4.0, -2.6, 0.7], 250)
+    recorded = np.concatenate([desk, there, lap, away])
+    recorded += rng.normal(0.0, 0.0005, recorded.shape)
+    assert driven_part(recorded) == slice(6200, 7100)
+    assert driven_part(lap) == slice(0, 900)
 
 
 def test_standing_still_before_and_after_changes_nothing():
