@@ -60,6 +60,12 @@ def one_output(contract: PolicyContract, raw: Any) -> Any:
     if not isinstance(raw, Mapping | list | tuple):
         return raw
     names = list(raw) if isinstance(raw, Mapping) else list(range(len(raw)))
+    if key is None and len(names) == 1 and hasattr(raw[names[0]], "shape"):
+        return raw[names[0]]
+    if isinstance(raw, list | tuple) and raw and all(isinstance(each, int | float) for each in raw):
+        raise PolicyContractError(
+            "expected an array of steering [B] or [B, 1], got a list of numbers; return one array"
+        )
     if key not in names:
         how = "output_name" if isinstance(raw, Mapping) else "output_index"
         raise PolicyContractError(

@@ -165,6 +165,11 @@ def _memory(request: Experiment, report: Report) -> dict[int, float]:
 
 
 def _on_the_gradient(found: Check) -> list[str]:
+    if found.gradient_norm == 0.0 and any(found.ticks.visible):
+        return [
+            "NO GRADIENT: an object is seen, but the policy's gradient in the picture is zero: look for argmax, rounding, clamping or a saturated output, "
+            "or it does not use the picture (advnerf policy check); methods without a gradient still work"
+        ]
     if found.gradient_norm == 0.0:
         return ["NO GRADIENT: no pixel of an object reaches a control; move the objects, or the start poses"]
     right = found.frozen_error <= EXACT

@@ -296,6 +296,14 @@ def test_a_network_of_several_outputs_is_asked_for_the_one_that_steers():
             adapt(network, PolicyContract(VIEW))(grey)
 
 
+def test_one_output_in_a_tuple_is_that_output_and_numbers_are_none():
+    grey = torch.full((1, 3, 8, 12), 0.5)
+    alone = adapt(lambda images: (images.mean(dim=(1, 2, 3)),), PolicyContract(VIEW))
+    torch.testing.assert_close(alone(grey), torch.full((1,), 0.5))
+    with pytest.raises(PolicyContractError, match=r"an array of steering \[B\] .*, got a list of numbers"):
+        adapt(lambda images: [0.5], PolicyContract(VIEW))(grey)
+
+
 def test_names_of_inputs_are_refused_where_there_is_no_file():
     with pytest.raises(PolicyContractError, match=r"for an \.onnx or \.pt2 file only"):
         adapt(TwoHeads(), PolicyContract(VIEW, input_name="images"))

@@ -1,5 +1,6 @@
 """A request run in a folder: killed and gone on with, shown, checked."""
 
+import dataclasses
 import datetime
 import json
 
@@ -203,6 +204,8 @@ def test_the_check_confirms_the_gradient_and_says_so(tmp_path):
     assert found.sound
     assert found.verdict[0].startswith("gradient right")
     np.testing.assert_allclose(found.ticks.visible, 1.0)
+    flat = dataclasses.replace(found, gradient_norm=0.0).verdict[0]
+    assert flat.startswith("NO GRADIENT: an object is seen, but the policy's gradient in the picture is zero")
 
 
 AWAY = "objects=[{name: a, kind: panel, x_m: -3.5, y_m: 3.0, face: {size_m: 0.8, resolution: 4}}]"
