@@ -56,8 +56,9 @@ def length_scale(
 
 
 def _of_name(model: Model, name: str) -> list[Registered]:
-    """Images of a name, which may lack its first folders."""
-    return [each for each in model.images if each.name == name or each.name.endswith(f"/{name}")]
+    """Images of a name; of one that no image has as a whole, those that end with it behind a folder."""
+    whole = [each for each in model.images if each.name == name]
+    return whole or [each for each in model.images if each.name.endswith(f"/{name}")]
 
 
 def _end(model: Model, points_by_id: Mapping[int, Array], name: str) -> Array:

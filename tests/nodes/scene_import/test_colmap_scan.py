@@ -149,12 +149,16 @@ def test_known_positions_give_metres_and_the_world(tmp_path, ring):
     assert not report["ground_at_zero"]
 
 
-def test_known_positions_may_leave_out_the_folders_of_images_as_a_length_may(tmp_path):
-    names = [f"walk/{number}.png" for number in range(8)]
+@pytest.mark.parametrize("beside", [False, True])
+def test_known_positions_may_leave_out_the_folders_of_images_as_a_length_may(tmp_path, beside):
+    """A whole name is that image's, though another one ends with it."""
+    ends = [f"{number}.png" for number in range(8)]
+    names = [*ends[:4], *(f"walk/{end}" for end in ends[:4])] if beside else [f"walk/{end}" for end in ends]
     scan = write(posed([in_colmap(T) for T in RING], names, floor()), tmp_path / "model")
-    known = write_positions(tmp_path / "gps.csv", RING, [f"{number}.png" for number in range(8)])
+    known = write_positions(tmp_path / "gps.csv", RING, names if beside else ends)
     run(tmp_path, scan, write_images(tmp_path / "pictures", names), positions=known)
-    frames, _ = loaded(tmp_path)
+    frames, report = loaded(tmp_path)
+    assert "known positions of 8 images" in str(report)
     for name, T in zip(names, RING, strict=True):
         np.testing.assert_allclose(frames[name].T_world_from_camera, T, atol=1e-3)
 
