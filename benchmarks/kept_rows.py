@@ -15,16 +15,8 @@ PUBLISHED = REPOSITORY / "docs" / "results"
 _COMPARED = ("value", "unit", "target", "met", "note")
 
 
-def retraining_rows() -> list[LedgerRow]:
-    """Rows of the rounds of attack and retraining."""
-    return [
-        LedgerRow(line, value, unit, target, met, retraining.COMMAND, note)
-        for line, value, unit, target, met, note in retraining.rows_of(retraining.kept_summaries())
-    ]
-
-
 _AGAIN: dict[str, Callable[..., list[LedgerRow]]] = {
-    "retraining": retraining_rows,
+    "retraining": retraining.ledger_rows,
     "gap": gap.ledger_rows,
     "predictions": predictions.ledger_rows,
     "paper": paper_table.ledger_rows,

@@ -15,7 +15,7 @@ import numpy as np
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from benchmarks.results import REPOSITORY, record_row
+from benchmarks.results import REPOSITORY, LedgerRow
 from nodes.experiment.show.given import victim_spec
 from nodes.experiment.steps import retrain_plot
 from nodes.experiment.steps.run import load_experiment
@@ -23,7 +23,6 @@ from nodes.experiment.steps.run import load_experiment
 _TARGET = 1.1
 _DRIVES = ("original_undisturbed", "original_attacked", "retrained_undisturbed", "retrained_attacked")
 COMMAND = "advnerf experiment run launch/junction.experiment.yaml --setting retrain --folder runs/retrain"
-Row = tuple[str, float, str, str, bool | None, str]  # line, value, unit, target, met, note
 _KEPT = REPOSITORY / "docs" / "results" / "retrain"
 
 
@@ -32,9 +31,14 @@ def kept_summaries() -> list[dict[str, Any]]:
     return [read_json(file) for file in (_KEPT / "retrain.json", *sorted(_KEPT.glob("seed_*.json")))]
 
 
-def rows_of(seeds: Sequence[dict[str, Any]]) -> list[Row]:
+def ledger_rows() -> list[LedgerRow]:
+    """Rows of what is kept."""
+    return rows_of(kept_summaries())
+
+
+def rows_of(seeds: Sequence[dict[str, Any]]) -> list[LedgerRow]:
     """Rows of the ledger, means over seeds: the retrained policies under the old attacks, and what attacks on each round's policies are worth."""
-    rows = list[Row]()
+    rows = list[LedgerRow]()
     for name in seeds[0]["old_attacks"]:
         drives = [each["old_attacks"][name] for each in seeds]
         totals = (
@@ -44,9 +48,8 @@ def rows_of(seeds: Sequence[dict[str, Any]]) -> list[Row]:
         ratios = [drive["ratio"] for drive in drives]
         line = f"retrained once, under the old attack, {name}, over the original undisturbed"
         note = f"seeds in turn: {_each(ratios, 3)}; one start that nothing has seen, deployed: {'; '.join(totals)}"
-        rows.append(
-            (line, float(np.mean(ratios)), "x", f"<= {_TARGET} x", bool(np.mean(ratios) <= _TARGET), note)
-        )
+        ratio = float(np.mean(ratios))
+        rows.append(LedgerRow(line, ratio, "x", f"<= {_TARGET} x", ratio <= _TARGET, COMMAND, note))
     for number in range(max(len(each["rounds"]) for each in seeds)):
         rows += _round_rows(
             number, {seed: each for seed, each in enumerate(seeds) if number < len(each["rounds"])}
@@ -54,8 +57,8 @@ def rows_of(seeds: Sequence[dict[str, Any]]) -> list[Row]:
     return rows
 
 
-def _round_rows(number: int, seeds: Mapping[int, dict[str, Any]]) -> list[Row]:
-    rounds, rows = [each["rounds"][number] for each in seeds.values()], list[Row]()
+def _round_rows(number: int, seeds: Mapping[int, dict[str, Any]]) -> list[LedgerRow]:
+    rounds, rows = [each["rounds"][number] for each in seeds.values()], list[LedgerRow]()
     paying = sum(
         max(each["surrogate"].values()) > seed["pays_m"]
         for each, seed in zip(rounds, seeds.values(), strict=True)
@@ -73,7 +76,8 @@ def _round_rows(number: int, seeds: Mapping[int, dict[str, Any]]) -> list[Row]:
         line = (
             f"attack on the policy after {number} round{'s' * (number != 1)} of retraining, {name}, deployed"
         )
-        rows.append((line, float(np.mean(deployed_m)), "m per tick of excess", "", None, note))
+        value = float(np.mean(deployed_m))
+        rows.append(LedgerRow(line, value, "m per tick of excess", "", None, COMMAND, note))
     return rows
 
 
@@ -111,9 +115,9 @@ def main() -> None:
     seeds = kept_summaries()
     longest = max(seeds, key=lambda each: len(each["rounds"]))
     retrain_plot.draw(REPOSITORY / "docs" / "retraining.png", longest["rounds"], longest["pays_m"])
-    for line, value, unit, target, met, note in rows_of(seeds):
-        print(f"{line}: {value:.2f} {unit} (target {target or '-'}): {met}")
-        record_row(line, value, unit, target, met, COMMAND, note)
+    for row in rows_of(seeds):
+        print(f"{row.line}: {row.value:.2f} {row.unit} (target {row.target or '-'}): {row.met}")
+        row.record()
 
 
 if __name__ == "__main__":

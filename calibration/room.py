@@ -45,12 +45,10 @@ def fence_from_trace(trace: ArrayLike, margin_m: float) -> tuple[tuple[float, fl
     require_a_way(xy, closed=True)
     canvas, origin = _canvas(xy, 0.2)
     # What the walk keeps apart from the outside. Filled as a polygon, a second lap would empty the first.
-    outside = cv2.polylines(np.pad(canvas, 1), [_to_pixels(xy, origin) + 1], True, 1)
-    cv2.floodFill(outside, None, (0, 0), 2)
-    canvas = (outside[1:-1, 1:-1] != 2).astype(np.uint8)
-    inside = (
-        cv2.distanceTransform(np.pad(canvas, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1] * _CELL_M
-    )
+    walked = cv2.polylines(np.pad(canvas, 1), [_to_pixels(xy, origin) + 1], True, 1)
+    cv2.floodFill(walked, None, (0, 0), 2)
+    enclosed = (walked != 2).astype(np.uint8)
+    inside = cv2.distanceTransform(enclosed, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1] * _CELL_M
     return _outline((inside > margin_m).astype(np.uint8), origin, f"inside of a margin of {margin_m:g} m")
 
 

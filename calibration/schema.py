@@ -39,7 +39,7 @@ Point2 = tuple[float, float]
 _RIGID_TOLERANCE = 1e-6
 _PLANAR_TOLERANCE_M = 0.005
 _LARGEST_FACE_M = 20.0  # a billboard of 14 x 48 feet has 15 m
-_FARTHEST_FACE_M = 20.0  # from the origin of its subject, whose markers are on it or beside it
+_FURTHEST_FACE_M = 20.0  # from the origin of its subject, whose markers are on it or beside it
 # Of a driving camera: the rear axle of a lorry is not further away, and one whose axis is turned by more looks at no road.
 _FURTHEST_CAMERA_M, _LEAST_AHEAD = 5.0, 0.5
 _LONGEST_WHEELBASE_M, _MOST_LATENCY_S = 8.0, 1.0
@@ -275,9 +275,9 @@ class TargetCalibration(Calibration):
         if np.ptp(points, axis=0).max() > _LARGEST_FACE_M:
             raise ValueError(f"expected a face of at most {_LARGEST_FACE_M:g} m; is it in cm or mm?")
         away_m = float(np.linalg.norm(points.mean(axis=0)))
-        if away_m > _FARTHEST_FACE_M:
+        if away_m > _FURTHEST_FACE_M:
             raise ValueError(
-                f"expected a face within {_FARTHEST_FACE_M:g} m of its subject's origin, got {away_m:.1f} m; is a length, such as the wand's tip, in cm or mm?"
+                f"expected a face within {_FURTHEST_FACE_M:g} m of its subject's origin, got {away_m:.1f} m; is a length, such as the wand's tip, in cm or mm?"
             )
         area = float(np.linalg.norm(normal))
         if area < 1e-4:

@@ -25,7 +25,7 @@ def test_retrained_policies_are_held_against_the_originals_undisturbed():
     ]
     old = {"right": {**drive, "ratio": 1.1}, "left": {**drive, "ratio": 1.11}}
     first = {"old_attacks": old, "rounds": rounds, "pays_m": 0.175}
-    rows = {line: (value, met) for line, value, _, _, met, _ in retraining.rows_of([first])}
+    rows = {row.line: (row.value, row.met) for row in retraining.rows_of([first])}
     assert rows["retrained once, under the old attack, right, over the original undisturbed"] == (1.1, True)
     assert rows["retrained once, under the old attack, left, over the original undisturbed"] == (1.11, False)
     assert rows["attack on the policy after 0 rounds of retraining, right, deployed"] == (4.0, None)
@@ -39,7 +39,7 @@ def test_retrained_policies_are_held_against_the_originals_undisturbed():
         "rounds": [{**cured, "deployed": {"right": 2.0, "left": 1.0}}, cured],
         "pays_m": 0.175,
     }
-    both = {line: (value, met, note) for line, value, _, _, met, note in retraining.rows_of([first, second])}
+    both = {row.line: (row.value, row.met, row.note) for row in retraining.rows_of([first, second])}
     ratio, met, note = both["retrained once, under the old attack, left, over the original undisturbed"]
     assert (ratio, met) == (pytest.approx(1.06), True)
     assert "seeds in turn: 1.110, 1.010" in note
