@@ -14,6 +14,10 @@ class DeviceError(AdvnerfError, RuntimeError):
     """A GPU was requested, but none is usable, or it does not support the request."""
 
 
+class NotFiniteError(AdvnerfError, ArithmeticError):
+    """A drive, loss or gradient has numbers that are NaN or infinite; the message says where they came from."""
+
+
 class ConfigError(AdvnerfError, ValueError):
     """A file that a user wrote, or an override of it, is wrong."""
 

@@ -23,14 +23,18 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.image_gradients import image_gradients, with_history
+from advnerf_core.attack.image_gradients import (
+    image_gradients,
+    require_finite_gradient,
+    with_history,
+)
 from advnerf_core.attack.objective import loss_slopes
 from advnerf_core.attack.problem import (
     AttackProblem,
     BlackBoxError,
-    SearchDivergedError,
     Sensor,
     Totals,
+    require_finite_parameters,
 )
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.rollout import Remembering, Rollout, drive
@@ -89,6 +93,7 @@ def roll_out(
     problem: AttackProblem, theta: Tensor, cache: RenderCache | None = None, keep_memories: bool = True
 ) -> tuple[Rollout, list[Tensor]]:
     """Drive the closed loop for ``theta``; also the memories ``[T + 1]`` of a policy that has one (else empty), for a gradient."""
+    require_finite_parameters(theta)
     step = 0
 
     def observe(states: Tensor) -> Tensor:
@@ -103,11 +108,6 @@ def roll_out(
     if not policy.stateless:
         policy = Remembering(policy, len(problem.start_states), keep_memories)
     rollout = drive(policy, observe, problem.dynamics, problem.start_states, problem.steps, problem.goals)
-    if not bool(torch.isfinite(rollout.states).all()):
-        tick = int((~torch.isfinite(rollout.states)).flatten(1).any(1).nonzero()[0])
-        raise SearchDivergedError(
-            f"expected finite states, got some that are not after {tick} ticks; check policy and scene for NaN"
-        )
     return rollout, policy.memories if isinstance(policy, Remembering) else []
 
 
@@ -263,5 +263,6 @@ def _sequential_terms(
             with_history(outputs[0])
             seeds = (control_slopes[t].to(outputs[0].dtype), memory_slope)
             grad_images, slope = torch.autograd.grad(outputs, (images, memory), seeds, allow_unused=True)
+        require_finite_gradient(grad_images)
         memory_slope = torch.zeros_like(memory) if slope is None else slope
         yield rendered.vjp(grad_images), again

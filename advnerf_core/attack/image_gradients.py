@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.errors import AdvnerfError, NotFiniteError
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.contract import PolicyContractError
 from advnerf_core.policies.number_type import layer_type
@@ -35,6 +35,9 @@ def image_gradients(
 
     Returns:
         ``[N, 3, H, W]``, in the type of the images.
+
+    Raises:
+        NotFiniteError: The gradient is not finite.
     """
     if reduced:
         # The layout that convolutions in bfloat16 take without a copy for each layer.
@@ -43,7 +46,22 @@ def image_gradients(
     with torch.enable_grad(), torch.autocast("cpu", torch.bfloat16, enabled=reduced):
         controls = with_history(policy(images, goals))
     (gradient,) = torch.autograd.grad(controls, images, slopes.to(controls.dtype))
+    require_finite_gradient(gradient)
     return gradient
+
+
+def require_finite_gradient(gradient: Tensor) -> None:
+    """Refuse a policy whose steering has a gradient ``[N, 3, H, W]`` with respect to its images that is NaN or infinite.
+
+    Raises:
+        NotFiniteError: It is.
+    """
+    wrong = int((~torch.isfinite(gradient)).flatten(1).any(1).sum())
+    if wrong:
+        raise NotFiniteError(
+            f"expected a finite gradient of the policy's steering with respect to its pictures, got NaN or infinity for {wrong} of {len(gradient)} "
+            "pictures; look in the policy for sqrt, norm or division at zero, or search with a method that needs no gradient"
+        )
 
 
 def with_history(steering: Tensor) -> Tensor:

@@ -22,16 +22,12 @@ from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.metrics import LAB_OFF_TRACK_M, Horizon
 from advnerf_core.driving.path import Path
 from advnerf_core.driving.solids import Solids
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.errors import AdvnerfError, NotFiniteError
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.scene.surrogate import Rendered
 
 Regulariser = Callable[[Tensor], tuple[float, Tensor]]
 """``theta -> (part of the loss, its gradient)``, for example `Smoothness`."""
-
-
-class SearchDivergedError(AdvnerfError, ArithmeticError):
-    """A drive, loss or gradient is not finite."""
 
 
 class BlackBoxError(AdvnerfError, TypeError):
@@ -40,6 +36,20 @@ class BlackBoxError(AdvnerfError, TypeError):
 
 class NoColoursError(AdvnerfError, TypeError):
     """A search that needs colours got other parameters."""
+
+
+def require_finite_parameters(theta: Tensor) -> None:
+    """Refuse parameters with NaN or infinity, before a drive that would blame the scene for them.
+
+    Raises:
+        NotFiniteError: There are some.
+    """
+    wrong = theta.numel() - int(torch.isfinite(theta).sum())
+    if wrong:
+        raise NotFiniteError(
+            f"expected finite parameters to drive with, got NaN or infinity in {wrong} of {theta.numel()}; check the steps of the method that proposed "
+            "them, or the file that they are from"
+        )
 
 
 class Sensor(Protocol):

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.driving.dynamics import Motion
+from advnerf_core.errors import NotFiniteError
 from advnerf_core.policies.network import Policy
 
 Observe = Callable[[Tensor], Tensor]
@@ -50,6 +51,9 @@ def drive(
         start_states: ``[B, n]``; its dtype is the dtype of the rollout.
         steps: Number of ticks, at least one.
         goals: ``[B, goal_size]`` for goal-conditioned policies, constant over the drive.
+
+    Raises:
+        NotFiniteError: A control or state is NaN or infinite.
     """
     if steps < 1:
         raise ValueError(f"expected at least one step, got {steps}")
@@ -59,8 +63,13 @@ def drive(
     controls = start_states.new_empty(steps, len(start_states))
     states[0] = start_states
     for t in range(steps):
-        controls[t] = _steer(policy, observe(states[t]), goals)
+        controls[t] = _answer(policy, observe(states[t]), goals, t)
         states[t + 1] = dynamics.step(states[t], controls[t])
+        if not bool(torch.isfinite(states[t + 1]).all()):
+            raise NotFiniteError(
+                f"expected a finite state of the car after tick {t}, got {_first_wrong(states[t + 1])} for finite steering; check the vehicle model, or "
+                "the world that moves the car"
+            )
     return Rollout(states, controls)
 
 
@@ -91,6 +100,25 @@ class Remembering:
             self.memories.clear()
         self.memories.append(memory)
         return steering
+
+
+def _answer(policy: Policy, images: Tensor, goals: Tensor | None, tick: int) -> Tensor:
+    """The policy's controls, which are finite."""
+    controls = _steer(policy, images, goals)
+    if bool(torch.isfinite(controls).all()):
+        return controls
+    if bool(torch.isfinite(images).all()):
+        raise NotFiniteError(
+            f"expected finite steering from the policy, got {_first_wrong(controls)} at tick {tick} for a picture without NaN; look in the policy for a "
+            "division by a spread, a logarithm of zero, or damaged weights"
+        )
+    raise NotFiniteError(
+        f"expected pictures without NaN for the policy, got {_first_wrong(images)} in that of tick {tick}; check the scene that renders them"
+    )
+
+
+def _first_wrong(numbers: Tensor) -> float:
+    return float(numbers[~torch.isfinite(numbers)][0])
 
 
 def _steer(policy: Policy, images: Tensor, goals: Tensor | None) -> Tensor:

@@ -342,16 +342,16 @@ def _gradient(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
         )
         return Finding("gradient", FAILURE, text)
     (slopes,) = torch.autograd.grad(steering.sum(), batch, allow_unused=True)
+    if slopes is not None and not bool(torch.isfinite(slopes).all()):
+        return Finding(
+            "gradient", FAILURE, "the gradient is NaN or infinite; look for sqrt, norm or division at zero"
+        )
     if slopes is None or not bool(slopes.abs().sum() > 0.0):
         text = (
             "the gradient is zero everywhere: look for argmax, rounding, clamping or a saturated output, and check the range of "
             "values; or declare differentiable = False"
         )
         return Finding("gradient", FAILURE, text)
-    if not bool(torch.isfinite(slopes).all()):
-        return Finding(
-            "gradient", FAILURE, "the gradient is NaN or infinite; look for sqrt, norm or division at zero"
-        )
     return _slope(examined, batch.detach(), slopes)
 
 

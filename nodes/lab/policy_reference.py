@@ -17,6 +17,7 @@ from advnerf_core.data.view_loading import load_image
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.driving.expert import Expert
 from advnerf_core.geometry import invert_transform, yaw_of
+from advnerf_core.plugins import FAILURES, in_one_line
 from advnerf_core.policies.adapter import AdaptedPolicy
 from advnerf_core.policies.conformance import FAILURE, OK, WARNING, Finding, Verdict
 from advnerf_core.policies.network import images_to_tensor, tensor_to_images
@@ -228,7 +229,10 @@ def judged_by_drives(
             for f in findings
         ]
     size = policy.contract.goal_size
-    clean = reference.drives(policy, goal if goal is not None else (0.0,) * size)
+    try:
+        clean = reference.drives(policy, goal if goal is not None else (0.0,) * size)
+    except FAILURES as error:  # of the policy, which may raise anything
+        return [*findings, Finding("drive", FAILURE, f"the drive without attack fails: {in_one_line(error)}")]
     text = clean.warning or f"drives without attack: {clean.in_words.removeprefix('drive without attack: ')}"
     verdict: Verdict = OK if clean.drives else FAILURE if reference.asked else WARNING
     return [*findings, Finding("drive", verdict, text)]

@@ -1,3 +1,4 @@
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -156,6 +157,11 @@ def test_a_policy_is_driven_round_the_path_in_the_scene(tmp_path):
     assert (failed.name, failed.verdict) == ("drive", FAILURE)
     assert "does not drive here" in failed.text
     assert judged_by_drives(circling(0.0), replace(reference, asked=False), right)[-1].verdict == WARNING
+    # Of what the check has found before, nothing is lost.
+    found = judged_by_drives(circling(math.nan), reference, right)
+    assert found[:-1] == right
+    assert (found[-1].name, found[-1].verdict) == ("drive", FAILURE)
+    assert "finite steering from the policy, got nan at tick 0" in found[-1].text
     bag = replace(reference, drives=None)
     assert [f.verdict for f in judged_by_drives(on_it, bag, right)] == [OK, FAILURE]
     wrong = [Finding("mode", FAILURE, "")]

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AdjointResult, gradient_pass
 from advnerf_core.attack.methods import FRESH_RUN, SearchRun, SearchSettings, StudentOptions
-from advnerf_core.attack.problem import AttackProblem, SearchDivergedError
+from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search.distil import (
     ArchitectureStudent,
     Distillation,
@@ -229,10 +229,6 @@ class _Loop:
         theta, number = known["theta"], len(self._state.history)
         problem = self._problem.at_draw(number)
         driven = VisitedDrive(problem, theta)
-        if not bool(torch.isfinite(driven.rollout.states).all()):
-            raise SearchDivergedError(
-                f"expected finite states at evaluation {number}, got some that are not; check the policy and the scene for NaN"
-            )
         if self._student is None:
             lessons = _first_lessons(
                 problem, driven, theta, self._coarse, self._search.distillation, self._generator

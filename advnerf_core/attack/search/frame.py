@@ -15,14 +15,15 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import evaluate, roll_out
-from advnerf_core.attack.image_gradients import with_history
+from advnerf_core.attack.image_gradients import require_finite_gradient, with_history
 from advnerf_core.attack.methods import SearchRun, SearchSettings
-from advnerf_core.attack.problem import AttackProblem, SearchDivergedError
+from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search.gradient import Slope, climb
 from advnerf_core.attack.search.query_count import VictimError
 from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.search.search import gradient_step
 from advnerf_core.attack.search.visited import Visited
+from advnerf_core.errors import NotFiniteError
 
 _NAME = "frame"
 # Distance in theta at which both sides are tried before one is chosen: strong colours, as far as `random` spreads them.
@@ -105,6 +106,7 @@ class CleanFrames:
                 images = rendered.images.detach().requires_grad_()
                 steering = with_history(problem.policy(images, goals)).sum()
                 (slope,) = torch.autograd.grad(steering, images)
+            require_finite_gradient(slope)
             yield float(steering.detach()), rendered.vjp(slope)
 
     def _visited(self, problem: AttackProblem) -> Iterator[Visited]:
@@ -124,7 +126,7 @@ def better_side(frames: CleanFrames, theta: Tensor) -> int:
     step = _LOOK * gradient.sign()
     left, right = frames.deviation(theta + step)[0], -frames.deviation(theta - step)[0]
     if not torch.isfinite(torch.tensor([left, right])).all():
-        raise SearchDivergedError(
+        raise NotFiniteError(
             f"expected finite steering on the frames without an attack, got deviations {left} and {right}; check the policy for NaN"
         )
     return 1 if left >= right else -1

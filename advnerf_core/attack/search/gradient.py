@@ -115,7 +115,7 @@ def climb(
         settings: Further settings that a state file must match, including the method's name.
 
     Raises:
-        SearchDivergedError: A loss or gradient is not finite.
+        NotFiniteError: A loss or gradient is not finite.
     """
     if cells:
         settings["cells"] = cells

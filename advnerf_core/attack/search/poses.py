@@ -77,7 +77,7 @@ def multi_start(
     Raises:
         PoseBoundsError: The bounds leave no place beside the lane.
         BlackBoxError: The policy has no gradient.
-        SearchDivergedError: A loss or gradient is not finite.
+        NotFiniteError: A loss or gradient is not finite.
         SearchStateError: The state file cannot be used.
     """
     budget = budget or MultiStart()
@@ -124,7 +124,7 @@ def random_poses(
 
     Raises:
         PoseBoundsError: The bounds leave no place beside the lane.
-        SearchDivergedError: A loss is not finite.
+        NotFiniteError: A drive is not finite.
         SearchStateError: The state file cannot be used.
     """
     sensor = placed_sensor(problem)

@@ -24,9 +24,9 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem, Totals, evaluate
 from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.objective import CrossTrackError
-from advnerf_core.attack.problem import ScaledSensor, SearchDivergedError
+from advnerf_core.attack.problem import ScaledSensor
 from advnerf_core.attack.search.record import Evaluation, SearchResult
-from advnerf_core.errors import AdvnerfError
+from advnerf_core.errors import AdvnerfError, NotFiniteError
 from advnerf_core.files import read_tensors, write_atomically
 
 _FORMAT = "advnerf-search-1"
@@ -178,28 +178,20 @@ def _keep(evaluation: Evaluation, state: SearchState, run: SearchRun, fingerprin
 
 
 def without_gradient(problem: AttackProblem, theta: Tensor, number: int) -> tuple[float, Totals]:
-    """Loss and totals of evaluation ``number`` of a search without a gradient.
-
-    Raises:
-        SearchDivergedError: The loss is not finite.
-    """
+    """Loss and totals of evaluation ``number`` of a search without a gradient."""
     _, totals = evaluate(problem.at_draw(number), theta)
     loss_m = float(totals.losses.mean())
     if problem.regulariser is not None:
         loss_m += problem.regulariser(theta)[0]
-    if not math.isfinite(loss_m):
-        raise SearchDivergedError(
-            f"expected a finite loss at evaluation {number}, got {loss_m}; check the policy and the scene for NaN"
-        )
     return loss_m, totals
 
 
 def require_finite(loss_m: float, gradient: Tensor, number: int) -> None:
-    """Raise `SearchDivergedError` unless loss and gradient of evaluation ``number`` are finite."""
+    """Raise `NotFiniteError` unless loss and gradient of evaluation ``number`` are finite."""
     if not (math.isfinite(loss_m) and bool(torch.isfinite(gradient).all())):
-        raise SearchDivergedError(
-            f"expected a finite loss and gradient at evaluation {number}, got loss {loss_m}; "
-            "check the policy and the scene for NaN"
+        raise NotFiniteError(
+            f"expected a finite loss and gradient at evaluation {number}, got loss {loss_m}; the policy's own gradient is finite: check the gradients of "
+            "the objects and the scene for NaN"
         )
 
 
@@ -214,7 +206,7 @@ def evaluate_theta(
         fingerprint: Fingerprint of the search, see `search_fingerprint`.
 
     Raises:
-        SearchDivergedError: The loss is not finite.
+        NotFiniteError: The drive is not finite.
     """
     began = time.perf_counter()
     loss_m, totals = without_gradient(problem, theta, len(state.history))

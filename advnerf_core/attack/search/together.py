@@ -20,7 +20,6 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Sensor, Totals, adjoint_gradient
 from advnerf_core.attack.methods import GRADIENT_RATE
-from advnerf_core.attack.problem import SearchDivergedError
 from advnerf_core.attack.search.descent import Descent
 from advnerf_core.attack.search.record import Evaluation, SearchResult
 from advnerf_core.attack.search.search import (
@@ -29,6 +28,7 @@ from advnerf_core.attack.search.search import (
     evaluation_from_json,
     search_fingerprint,
 )
+from advnerf_core.errors import NotFiniteError
 from advnerf_core.files import read_tensors, write_atomically
 from advnerf_core.scene.device_surrogate import DeviceSurrogate
 from advnerf_core.scene.many_textures import ManyTextures
@@ -104,7 +104,7 @@ def gradient_attacks(
         settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
 
     Raises:
-        SearchDivergedError: A loss or gradient is not finite.
+        NotFiniteError: A loss or gradient is not finite.
         SearchStateError: The state file cannot be used.
     """
     if iterations < 1 or not problems or len(problems) != len(seeds):
@@ -152,8 +152,8 @@ def _gradients(batch: _Batch, theta: Tensor, draw: int) -> tuple[list[float], li
             losses[-1] += extra
             gradient[k] += slope
     if not (all(math.isfinite(loss) for loss in losses) and bool(torch.isfinite(gradient).all())):
-        raise SearchDivergedError(
-            f"expected finite losses and gradients at iteration {draw}, got losses {losses}; check the policy and the scene for NaN"
+        raise NotFiniteError(
+            f"expected finite losses and gradients at iteration {draw}, got losses {losses}; the policy's own gradient is finite: check the gradients of the objects and the scene for NaN"
         )
     return losses, totals, gradient
 

@@ -6,6 +6,7 @@ from torch import nn
 from torch.nn.functional import cosine_similarity
 
 from advnerf_core.attack.image_gradients import LEAST_COSINE, agrees_in_bfloat16, image_gradients
+from advnerf_core.errors import NotFiniteError
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.contract import PolicyContractError
 from advnerf_core.policies.number_type import layer_type
@@ -42,6 +43,20 @@ def test_in_float32_it_is_the_derivative():
     with torch.no_grad():
         high, low = (slopes @ policy(images + step * way) for step in (1e-4, -1e-4))
     assert abs((high - low) / 2e-4 - (gradient * way).sum()) < 1e-6 * gradient.norm() * way.norm()
+
+
+def test_a_gradient_without_numbers_is_blamed_on_the_policy():
+    class Rooted(nn.Module):
+        def forward(self, images, goals=None):
+            return images.pow(2).sum((1, 2, 3)).sqrt()
+
+    images = torch.rand(3, 3, 4, 5, generator=torch.Generator().manual_seed(1))
+    images[1] = 0.0  # the root's value is 0 there, and its slope is not a number
+    with pytest.raises(
+        NotFiniteError,
+        match=r"gradient of the policy's steering .* for 1 of 3 pictures; look in the policy for sqrt",
+    ):
+        image_gradients(Rooted(), images, None, torch.ones(3))
 
 
 def test_in_bfloat16_the_direction_stays():

@@ -8,11 +8,11 @@ import torch
 
 from advnerf_core.attack.adjoint import BlackBoxError, adjoint_gradient
 from advnerf_core.attack.methods import SearchRun
-from advnerf_core.attack.problem import SearchDivergedError
 from advnerf_core.attack.search.cem import CrossEntropy
 from advnerf_core.attack.search.evolution import Evolution, rank_utilities
 from advnerf_core.attack.search.population import Coarse, population_search
 from advnerf_core.attack.search.search import SearchStateError
+from advnerf_core.errors import NotFiniteError
 from tests.support.attack_toy import random_policy, toy_problem
 
 STRATEGIES = [CrossEntropy(), Evolution()]
@@ -127,12 +127,12 @@ def test_a_black_box_can_be_searched_but_not_differentiated(problem):
         adjoint_gradient(closed, result.theta)
 
 
-def test_a_loss_that_is_not_finite_is_one_clear_error(problem):
+def test_a_policy_without_an_answer_is_one_clear_error(problem):
     class Broken(BlackBox):
         def __call__(self, images, goals=None):
             return torch.full((len(images),), torch.nan)
 
-    with pytest.raises(SearchDivergedError, match="not after 1 ticks; check policy and scene for NaN"):
+    with pytest.raises(NotFiniteError, match="finite steering from the policy, got nan at tick 0"):
         population_search(dataclasses.replace(problem, policy=Broken()), CrossEntropy(), 4, 4)
 
 

@@ -6,10 +6,10 @@ import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.attack.methods import SearchRun
-from advnerf_core.attack.problem import SearchDivergedError
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.random_search import random_search
 from advnerf_core.attack.search.search import SearchState, SearchStateError, draw_start_states, load_state
+from advnerf_core.errors import NotFiniteError
 from advnerf_core.scene.surrogate import Rendered
 from tests.support.attack_toy import toy_problem
 
@@ -123,7 +123,7 @@ def test_a_gradient_that_is_not_finite_is_one_clear_error(problem):
                 rendered.images, lambda grad: torch.full(self.theta_shape, torch.nan), rendered.nbytes
             )
 
-    with pytest.raises(SearchDivergedError, match="at evaluation 0"):
+    with pytest.raises(NotFiniteError, match="at evaluation 0"):
         gradient_attack(dataclasses.replace(problem, sensor=Broken()), 2)
 
 

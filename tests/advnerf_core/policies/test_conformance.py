@@ -217,6 +217,7 @@ def test_nan():
         (lambda x: x.detach(), lambda y: y.detach(), "no gradient reaches the image"),
         (lambda x: torch.round(x * 255) / 255, lambda y: y, "the gradient is zero everywhere"),
         (lambda x: x, lambda y: torch.round(y * 50) / 50 + 0 * y, "the gradient is zero everywhere"),
+        (lambda x: x + 0.0 * (0.0 * x).sqrt(), lambda y: y, "the gradient is NaN or infinite"),
         (lambda x: 0.5 * x + 0.5 * x.detach(), lambda y: y, "differs from finite differences by"),
     ],
 )

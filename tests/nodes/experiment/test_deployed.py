@@ -11,16 +11,15 @@ import torch
 from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Line, Path
+from advnerf_core.errors import NotFiniteError
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform
 from advnerf_core.objects.voxel.model import load_object
 from advnerf_core.policies.network import images_to_tensor
 from advnerf_core.policies.view import PolicyView
-from hardware.worlds.world import WorldError
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DressedScene, IdealDriving, SelfDriving, drive_deployed
 from nodes.experiment.show.objects import object_file
-from tests.support.warehouse import small
 
 STRAIGHT = Path.from_segments((0.0, 0.0, 0.0), [Line(60.0)], closed=False)
 
@@ -153,15 +152,14 @@ def test_a_blocked_car_is_charged_what_it_had(make_wall: Any) -> None:
     assert done.metrics.total_cte_m < free.metrics.total_cte_m
 
 
-def test_a_command_that_is_no_number_ends_a_drive_of_a_world_with_the_reason():
+def test_a_command_that_is_no_number_ends_a_drive_of_a_world_with_the_reason(make_wall: Any) -> None:
     """A world's usual clamp passes NaN on, and its car then seems to be blocked: a policy that fails would have driven well."""
-    with small().make() as world:
-        driving = SelfDriving(world, 1.0, 0.1)
-        driving.start(np.array([-5.0, 0.0, 0.0]))
-        states = driving.step(torch.tensor([[-5.0, 0.0, 0.0]]), torch.tensor([0.1]))
-        assert torch.isfinite(states).all()
-        for wrong in (math.nan, math.inf):
-            with pytest.raises(
-                WorldError, match=rf"expected a finite command from the policy, got {wrong} at tick 1"
-            ):
-                driving.step(states, torch.tensor([wrong]))
+
+    class Broken(Steady):
+        def __call__(self, images, goals=None):
+            return torch.full((len(images),), math.nan)
+
+    limits = Horizon(ticks=6, dt_s=0.1, off_track_m=1.75, held_cap_m=6.0)
+    scene = make_wall()
+    with pytest.raises(NotFiniteError, match="finite steering from the policy, got nan at tick 0"):
+        drive_deployed(dressed(scene), Broken(), (1.0,), np.zeros(3), STRAIGHT, limits, own_car(scene), None)
