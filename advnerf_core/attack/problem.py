@@ -38,6 +38,22 @@ class NoColoursError(AdvnerfError, TypeError):
     """A search that needs colours got other parameters."""
 
 
+class ZeroGradientError(AdvnerfError, ValueError):
+    """A search along a gradient begins where the gradient is exactly zero: every drive of it would be the first one again.
+
+    Attributes:
+        theta: Parameters of the first drive.
+    """
+
+    def __init__(self, theta: Tensor) -> None:
+        super().__init__(
+            f"expected a gradient to follow, got exactly zero for all {theta.numel()} parameters at the first drive: no picture shows the objects, or "
+            "the policy's steering does not depend on them (argmax, rounding, clamping, a saturated output), or the objective not on the drive; "
+            "'advnerf attack check' says which; methods without a gradient may still work"
+        )
+        self.theta = theta
+
+
 def require_finite_parameters(theta: Tensor) -> None:
     """Refuse parameters with NaN or infinity, before a drive that would blame the scene for them.
 

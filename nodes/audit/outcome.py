@@ -42,7 +42,7 @@ from nodes.audit.kept import RESULT, keep_drives
 from nodes.audit.page import write_page
 from nodes.audit.question import JUDGING_SEED, SELECTION_SEED, SELECTION_STARTS, VICTIM, AuditedQuestion
 from nodes.audit.schedule import NEVER_TRIED
-from nodes.audit.searching import FoundAttack, Searches
+from nodes.audit.searching import ZERO_GRADIENT, FoundAttack, Searches
 from nodes.audit.sentence import sentence_of
 from nodes.audit.spots import Spot
 from nodes.experiment.plan.object_kinds import extent_m, name_of
@@ -233,11 +233,15 @@ def _not_tried(known: Known) -> Iterator[NotTried]:
     yield from (NotTried(what=what, why=why) for what, why in NEVER_TRIED.items())
     if known.searches is None:
         return
+    flat = known.searches.flat
     done = {each.setting for each in known.searches.found}
     for number, (wanted, row) in enumerate(
         zip(known.searches.rounds, known.searches.planned, strict=True), start=1
     ):
-        left = len(row) - sum(name.startswith(f"{number}-") for name in done)
+        begun, zero = (sum(name.startswith(f"{number}-") for name in names) for names in (done, flat))
+        if zero:
+            yield NotTried(what=f"{zero} searches by {wanted.method} (round {number})", why=ZERO_GRADIENT)
+        left = len(row) - begun - zero
         if left > 0:
             why = "interrupted" if known.interrupted else "the audit ended before it"
             yield NotTried(what=f"{left} searches by {wanted.method} (round {number})", why=why)

@@ -42,7 +42,7 @@ from nodes.audit.question import (
     VICTIM,
     AuditedQuestion,
 )
-from nodes.audit.searching import FoundAttack, Searches
+from nodes.audit.searching import ZERO_GRADIENT, FoundAttack, Searches
 from nodes.audit.spots import Spot, best_spots, place_sha256
 from nodes.experiment.plan.object_kinds import footprint_m
 from nodes.experiment.show.context import Experiment
@@ -159,7 +159,11 @@ class Audit:
             known.interrupted = True
             self.say("interrupted: what was found is judged; Ctrl-C again ends at once")
         if searches.best is None:
-            raise CannotJudgeError("interrupted before the first search was finished")
+            raise CannotJudgeError(
+                f"{ZERO_GRADIENT} at every spot, and no search without one was run; check it ('advnerf policy check')"
+                if searches.flat
+                else "interrupted before the first search was finished"
+            )
         self._judge(known, copies, plan, searches.best)
         assert known.judged
         if known.judged[-1].judgement.found or (known.against is not None and known.against.is_worse):

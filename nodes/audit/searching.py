@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from advnerf_core.attack.problem import ZeroGradientError
 from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import drive_metrics
 from nodes.audit.cluster import SearchJob, search_on_cluster
@@ -25,6 +26,7 @@ from nodes.experiment.steps.search_files import ATTACK, SEARCHED
 from nodes.runtime.progress import Report, StageDisplay
 
 SEARCHES = "searches"
+ZERO_GRADIENT = "the policy's gradient is exactly zero"
 Say = Callable[[str], None]
 
 
@@ -71,6 +73,7 @@ class Searches:
         remembers: Whether its output depends on earlier images.
         limit_m: |CTE| beyond which the car has left its lane [m].
         cluster: Address of a Ray cluster for the searches; None for this process.
+        flat: Settings of the searches that found a gradient of zero, so that they could not begin.
     """
 
     copies: Copies
@@ -83,6 +86,7 @@ class Searches:
     limit_m: float
     cluster: str | None = None
     found: list[FoundAttack] = field(default_factory=list)
+    flat: list[str] = field(default_factory=list)
 
     @property
     def rounds(self) -> tuple[Round, ...]:
@@ -122,9 +126,15 @@ class Searches:
                 search_on_cluster(self.cluster, jobs)
             for search, job in zip(row, jobs, strict=True):
                 spot = spots[search.spot]
-                found = self._search(
-                    wanted, search, spot, job, display.start(f"{wanted.method} at spot {spot + 1}")
-                )
+                report = display.start(f"{wanted.method} at spot {spot + 1}")
+                try:
+                    found = self._search(wanted, search, spot, job, report)
+                except ZeroGradientError:
+                    self.flat.append(job.setting)
+                    say(
+                        f"{wanted.method} at spot {spot + 1}: {ZERO_GRADIENT}, so that it cannot search there"
+                    )
+                    continue
                 self.found.append(found)
                 say(
                     f"{found.method} at spot {found.spot + 1}, {found.evaluations} evaluations: largest deviation "

@@ -24,6 +24,7 @@ from advnerf_core.attack.search.search import (
     go_on,
     gradient_step,
     require_finite,
+    require_slope,
     search_fingerprint,
 )
 from advnerf_core.errors import AdvnerfError
@@ -116,6 +117,7 @@ def climb(
 
     Raises:
         NotFiniteError: A loss or gradient is not finite.
+        ZeroGradientError: The first gradient is zero.
     """
     if cells:
         settings["cells"] = cells
@@ -139,6 +141,7 @@ def climb(
         theta = coarse.expand(descent.theta)
         slope = slope_of(problem.at_draw(number), theta)
         require_finite(slope.loss_m, slope.gradient, number)
+        require_slope(theta, slope.gradient, number)
         evaluated = theta.clone()  # before Adam changes it in place
         descent.step(coarse.gathered(slope.gradient))
         evaluation = state.record(evaluated, slope.loss_m, slope.totals, time.perf_counter() - began)

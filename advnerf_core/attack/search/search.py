@@ -24,7 +24,7 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem, Totals, evaluate
 from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.objective import CrossTrackError
-from advnerf_core.attack.problem import ScaledSensor
+from advnerf_core.attack.problem import ScaledSensor, ZeroGradientError
 from advnerf_core.attack.search.record import Evaluation, SearchResult
 from advnerf_core.errors import AdvnerfError, NotFiniteError
 from advnerf_core.files import read_tensors, write_atomically
@@ -184,6 +184,12 @@ def without_gradient(problem: AttackProblem, theta: Tensor, number: int) -> tupl
     if problem.regulariser is not None:
         loss_m += problem.regulariser(theta)[0]
     return loss_m, totals
+
+
+def require_slope(theta: Tensor, gradient: Tensor, number: int) -> None:
+    """Raise `ZeroGradientError` if the gradient of the first evaluation is zero."""
+    if number == 0 and not bool(gradient.any()):
+        raise ZeroGradientError(theta)
 
 
 def require_finite(loss_m: float, gradient: Tensor, number: int) -> None:

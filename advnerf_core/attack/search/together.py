@@ -26,6 +26,7 @@ from advnerf_core.attack.search.search import (
     SearchState,
     SearchStateError,
     evaluation_from_json,
+    require_slope,
     search_fingerprint,
 )
 from advnerf_core.errors import NotFiniteError
@@ -105,6 +106,7 @@ def gradient_attacks(
 
     Raises:
         NotFiniteError: A loss or gradient is not finite.
+        ZeroGradientError: The first gradient of a seed is zero.
         SearchStateError: The state file cannot be used.
     """
     if iterations < 1 or not problems or len(problems) != len(seeds):
@@ -125,6 +127,8 @@ def gradient_attacks(
     while len(states[0].history) < iterations:
         began, draw = time.perf_counter(), len(states[0].history)
         loss, totals, gradient = _gradients(batch, descent.theta, draw)
+        for theta, slope in zip(descent.theta, gradient, strict=True):
+            require_slope(theta, slope, draw)
         evaluated = descent.theta.clone()  # before Adam changes it in place
         descent.step(gradient)
         spent_s = (time.perf_counter() - began) / len(seeds)

@@ -165,6 +165,10 @@ def _memory(request: Experiment, report: Report) -> dict[int, float]:
 
 
 def _on_the_gradient(found: Check) -> list[str]:
+    if not any((*found.ticks.lambda_position, *found.ticks.lambda_yaw)):
+        return [
+            "NO GRADIENT: the objective does not change with the car's states on this drive: is it a hinge that is not reached, or a count?"
+        ]
     if found.gradient_norm == 0.0 and any(found.ticks.visible):
         return [
             "NO GRADIENT: an object is seen, but the policy's gradient in the picture is zero: look for argmax, rounding, clamping or a saturated output, "

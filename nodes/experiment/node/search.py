@@ -69,7 +69,8 @@ def search(
     """Search as requested; an exception from ``on_evaluation`` ends the search, which then resumes from its state file."""
     _, settings = chosen_method(prepared.experiment)
     run = SearchRun(prepared.seed, state_path, on_evaluation, prepared.settings_hash)
-    return prepared.space.search(prepared.cell.code, on_chosen_device(prepared.problem), settings, run)
+    with prepared.telling_unseen():
+        return prepared.space.search(prepared.cell.code, on_chosen_device(prepared.problem), settings, run)
 
 
 def planned_evaluations(prepared: Prepared) -> int:
@@ -213,15 +214,16 @@ def _run_together(
         )
         for one in each
     ]
-    results = gradient_attacks(
-        all_on_chosen_device([one.problem for one in each]),
-        seeds,
-        wanted.evaluations,
-        wanted.step or wanted.learning_rate,
-        state_path,
-        lambda k, evaluation: told[k](evaluation),
-        prepared.settings_hash,
-    )
+    with prepared.telling_unseen():
+        results = gradient_attacks(
+            all_on_chosen_device([one.problem for one in each]),
+            seeds,
+            wanted.evaluations,
+            wanted.step or wanted.learning_rate,
+            state_path,
+            lambda k, evaluation: told[k](evaluation),
+            prepared.settings_hash,
+        )
     for one, result in zip(each, results, strict=True):
         _keep(one, result)
         display.finish(f"seed_{one.seed}", sum(e.seconds for e in result.history), cached=False)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -19,6 +20,7 @@ from advnerf_core.attack.image_gradients import agrees_in_bfloat16
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.objectives import CTE, load_objective, objective_entry, objective_key
 from advnerf_core.attack.on_device import on_chosen_device, said_of_device
+from advnerf_core.attack.problem import ZeroGradientError
 from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space, half_precision
@@ -114,13 +116,26 @@ class Prepared:
         Raises:
             ConfigError: No picture of the drive depends on the objects.
         """
-        problem = self.problem.undisturbed()
         differ = len({each.total_cte_m for each in found.history}) > 1
-        if isinstance(self.experiment.config.space, MeshShapeConfig) or (differ and problem is self.problem):
+        if not (differ and self.problem.undisturbed() is self.problem):
+            self._require_pictures_of(found.theta)
+
+    @contextmanager
+    def telling_unseen(self) -> Iterator[None]:
+        """Say of a search that has no gradient to begin with whether its objects are out of view."""
+        try:
+            yield
+        except ZeroGradientError as error:
+            self._require_pictures_of(error.theta.cpu())
+            raise
+
+    def _require_pictures_of(self, theta: torch.Tensor) -> None:
+        if isinstance(self.experiment.config.space, MeshShapeConfig):
             return
-        rollout, _ = evaluate(problem, found.theta)
+        problem = self.problem.undisturbed()
+        rollout, _ = evaluate(problem, theta)
         for tick, states in enumerate(rollout.states[:-1]):
-            one, other = (problem.sense((tick,), states, theta) for theta in (found.theta, 1.0 - found.theta))
+            one, other = (problem.sense((tick,), states, each) for each in (theta, 1.0 - theta))
             if not torch.equal(one.images, other.images):
                 return
         names = ", ".join(each.name for each in self.experiment.objects) or "the attacked face"
@@ -331,7 +346,8 @@ def _search(prepared: Prepared, folder: Path, report: Callable[..., None]) -> Se
     budget = search_settings(experiment, method)
     told = telling(method.evaluations(problem, budget), report, objective=problem.objective)
     run = SearchRun(cell.seed, folder / _STATE, told, settings.key)
-    return prepared.space.search(cell.code, on_chosen_device(problem), budget, run)
+    with prepared.telling_unseen():
+        return prepared.space.search(cell.code, on_chosen_device(problem), budget, run)
 
 
 def attack_file(prepared: Prepared, result: SearchResult) -> AttackFile:

@@ -11,6 +11,7 @@ import torch
 from advnerf_core.attack import image_gradients
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.attack.problem import ZeroGradientError
 from advnerf_core.attack.search.black_box import BudgetError
 from advnerf_core.display import DisplayModel
 from advnerf_core.policies.contract import PolicyContract
@@ -206,6 +207,9 @@ def test_the_check_confirms_the_gradient_and_says_so(tmp_path):
     np.testing.assert_allclose(found.ticks.visible, 1.0)
     flat = dataclasses.replace(found, gradient_norm=0.0).verdict[0]
     assert flat.startswith("NO GRADIENT: an object is seen, but the policy's gradient in the picture is zero")
+    still = dataclasses.replace(found.ticks, lambda_position=(0.0, 0.0), lambda_yaw=(0.0, 0.0))
+    unmoved = dataclasses.replace(found, ticks=still).verdict[0]
+    assert unmoved.startswith("NO GRADIENT: the objective does not change with the car's states")
 
 
 AWAY = "objects=[{name: a, kind: panel, x_m: -3.5, y_m: 3.0, face: {size_m: 0.8, resolution: 4}}]"
@@ -217,7 +221,14 @@ def test_an_object_out_of_sight_has_no_gradient_and_the_check_says_so(tmp_path):
     assert found.verdict[0].startswith("NO GRADIENT")
 
 
-@pytest.mark.parametrize("changes", [["over.method=[random]"], ["attack.robustness.noise=0.01"]])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ["over.method=[random]"],
+        ["attack.robustness.noise=0.01"],
+        ["over.seed=[0, 1]", "attack.together=true"],
+    ],
+)
 def test_a_search_of_an_object_out_of_sight_is_no_result(tmp_path, changes):
     request = loaded(tiny_request(tmp_path, evaluations=2), [AWAY, *changes])
     with pytest.raises(ConfigError, match=r"expected a in view of the searched drives, got \d+ ticks whose"):
@@ -234,6 +245,20 @@ def test_a_policy_that_ignores_what_it_sees_is_a_result(tmp_path):
     save_policy(tmp_path / "policy.safetensors", policy.policy, policy.view, {})
     (found,) = run_attack(loaded(file, ["over.method=[random]"]), tmp_path / "run", ProgressDisplay())
     assert len(set(json.loads(found.with_name("seed_0.json").read_text())["predicted_total_cte_m"])) == 1
+
+
+@pytest.mark.parametrize("method", ["gradient", "frame"])
+def test_a_gradient_that_is_zero_finds_nothing_and_ends_the_search_at_once(tmp_path, method):
+    """The policy clips what it would steer: its starting noise was told as the attack of a gradient, and looked like a robust policy."""
+    file = tiny_request(tmp_path, evaluations=50)
+    policy = load_policy(tmp_path / "policy.safetensors")
+    with torch.no_grad():
+        for weights in policy.policy.parameters():
+            weights.zero_()
+    save_policy(tmp_path / "policy.safetensors", policy.policy, policy.view, {})
+    with pytest.raises(ZeroGradientError, match=r"exactly zero for all \d+ parameters at the first drive"):
+        run_attack(loaded(file, [f"over.method=[{method}]"]), tmp_path / "run", ProgressDisplay())
+    assert not attack_file(tmp_path / "run", 0).exists()
 
 
 def test_every_result_stands_beside_the_drive_without_attack(tmp_path, monkeypatch, capsys):

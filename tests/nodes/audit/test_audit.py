@@ -146,6 +146,10 @@ def test_a_blind_policy_is_cleared_once_a_planted_weakness_was_found(
     assert result.planted is not None
     assert result.planted.found
     assert "no object was found within this budget" in result.verdict.sentence
+    # No gradient leads a policy that does not look, and its gradient searches are not told as ones that found nothing.
+    assert "gradient at spot 1: the policy's gradient is exactly zero" in found.stdout
+    assert {"random_coarse"} == {each.method for each in result.tried}
+    assert sum("gradient is exactly zero" in each.why for each in result.not_tried) == 3
 
 
 def test_a_policy_that_does_not_drive_is_not_judged(
