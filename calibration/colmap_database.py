@@ -16,6 +16,7 @@ import numpy as np
 
 from advnerf_core.data.image_files import image_size
 from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array
 from calibration.lens_choice import FIRST_MODEL, FOCAL_RATIOS
 from calibration.photo_model import PhotoSource, Report, SfmConfig
 from calibration.photo_pairs import chosen_pairs, every_pair
@@ -24,6 +25,7 @@ _FILE, _KEY = "database.db", "inputs.json"
 _MOST_TRIALS = 2000
 # Pairs are matched in calls of about this length, so that progress moves; each call builds its index of features again.
 _CALL_S, _FIRST_PAIRS, _MOST_PAIRS = 2.0, 8, 400
+_FEWEST_MATCHES = 30  # of a pair whose geometry says something
 # Raised when cameras or features are made in another way: earlier work is then repeated.
 _VERSION = 2
 # Where the focal length is unknown: a phone's main camera and most others lie within a factor of two of this many image widths.
@@ -226,3 +228,25 @@ def match(file: Path, work: Path, pairs: Sequence[tuple[str, str]], seed: int, r
         rate = len(chunk) / max(time.monotonic() - began_s, 1e-3)
         at_once = min(max(round(_CALL_S * rate), _FIRST_PAIRS), _MOST_PAIRS)
     report(1.0, f"{len(pairs)} of {len(pairs)} pairs of images matched")
+
+
+def verified_matches(file: Path) -> list[tuple[Array, Array]]:
+    """Matches that fit the geometry of their pair, as `calibration.only_turned.turned` takes them."""
+    import pycolmap
+
+    with pycolmap.Database.open(file) as stored:
+        cameras = {each.camera_id: each for each in stored.read_all_cameras()}
+        camera_of = {each.image_id: cameras[each.camera_id] for each in stored.read_all_images()}
+        found: list[tuple[Array, Array]] = []
+        keypoints: dict[int, Array] = {}
+        for pair, geometry in zip(*stored.read_two_view_geometries(), strict=True):
+            if len(geometry.inlier_matches) < _FEWEST_MATCHES:
+                continue
+            images = pycolmap.pair_id_to_image_pair(pair)
+            for image in images:
+                if image not in keypoints:
+                    size = np.array([camera_of[image].width, camera_of[image].height])
+                    keypoints[image] = (stored.read_keypoints(image)[:, :2] - size / 2) / size.max()
+            one, other = (keypoints[image][geometry.inlier_matches[:, k]] for k, image in enumerate(images))
+            found.append((one, other))
+    return found

@@ -17,6 +17,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
 from calibration import colmap_database as database
 from calibration.lens_choice import FOCAL_RATIOS, LensChoice, choose_lenses, intrinsics
+from calibration.only_turned import turned
 from calibration.photo_model import (
     MIN_IMAGES,
     FoundCamera,
@@ -64,6 +65,7 @@ def _find_model(
     )
     pairs = database.pairs_to_match(file, sources, config)
     database.match(file, work, pairs, config.seed, _part(report, _FEATURES_UNTIL, _MATCHES_UNTIL))
+    _require_moved(file)
     held = database.held_cameras(file, sources)
     best, parts = _map(
         file, root, work, held, len(names), config, _part(report, _MATCHES_UNTIL, _POSES_UNTIL)
@@ -76,6 +78,16 @@ def _find_model(
     why |= {name: elsewhere for name in names if name not in placed}
     _write_finished(work, best, parts, choices, why)
     return _model(best, sources, cameras, parts, choices, why)
+
+
+def _require_moved(file: Path) -> None:
+    """Refuse photographs of a camera that only turned: noise would be taken for parallax, and poses, lens and scale be invented."""
+    found = turned(database.verified_matches(file))
+    if found.only:
+        raise ReconstructionError(
+            f"expected photographs from different places, got ones of a camera that only turned: rotation alone explains the matches of {found.share:.0%} "
+            f"of {found.pairs} pairs of them; move the camera between photographs, by a tenth of the distance to what it sees or more"
+        )
 
 
 def _part(report: Report, low: float, high: float) -> Report:
