@@ -83,6 +83,7 @@ class PositionFit:
         rms_m: Root mean square distance of the cameras from their positions [m].
         worst_m: Largest such distance [m].
         worst: Image with this distance.
+        not_used: The first positions that name no single image, and why, as text; empty if all do.
         on_line: Whether the positions are on one line, so that up comes from the cameras or the ground.
     """
 
@@ -91,6 +92,7 @@ class PositionFit:
     rms_m: float
     worst_m: float
     worst: str
+    not_used: str
     on_line: bool
 
 
@@ -101,18 +103,20 @@ def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: 
         ground: Ground of the model; it determines the up direction if the positions are on one line.
 
     Raises:
-        ReconstructionError: The positions do not fit the model.
+        ReconstructionError: Two positions are of one image, or the positions do not fit the model.
         SimilarityError: They do not fix scale and direction.
     """
-    placed = [(found[0], name) for name in positions_m if len(found := _of_name(model, name)) == 1]
-    images = [image for image, _ in placed]
-    if len(images) < 2:
+    found = {name: _of_name(model, name) for name in positions_m}
+    row_of = _one_row_each({name: each[0] for name, each in found.items() if len(each) == 1})
+    not_used = _not_used(found)
+    if len(row_of) < 2:
         raise ReconstructionError(
-            f"expected positions of at least 2 of the model's images, got {len(images)}; "
+            f"expected positions of at least 2 of the model's images, got {len(row_of)}{not_used and f' ({not_used})'}; "
             f"write the names as COLMAP does: {', '.join(each.name for each in model.images[:_SHOWN])}"
         )
+    images = [found[name][0] for name in row_of.values()]
     source = np.stack([each.T_world_from_camera[:3, 3] for each in images])
-    target = np.stack([np.asarray(positions_m[name], np.float64) for _, name in placed])
+    target = np.stack([np.asarray(positions_m[name], np.float64) for name in row_of.values()])
     up = cameras_up(model.poses) if ground is None else ground.up
     similarity, on_line = fit_positions(source, target, up)
     errors = np.linalg.norm(similarity.points(source) - target, axis=1)
@@ -133,7 +137,33 @@ def fit_known_positions(model: Model, positions_m: Mapping[str, Array], ground: 
         )
     if compared:
         _refuse_outlier(source, target, up, rms, [each.name for each in images], worst)
-    return PositionFit(similarity, len(images), rms, float(errors[worst]), images[worst].name, on_line)
+    return PositionFit(
+        similarity, len(images), rms, float(errors[worst]), images[worst].name, not_used, on_line
+    )
+
+
+def _one_row_each(image_of: Mapping[str, Registered]) -> dict[str, str]:
+    """Names of the positions by the image's own name; an error for a second position of one image."""
+    row_of: dict[str, str] = {}
+    for row, image in image_of.items():
+        if (earlier := row_of.setdefault(image.name, row)) != row:
+            raise ReconstructionError(
+                f"expected one position for each image, got those of {earlier} and {row}, which are both {image.name}; remove one row"
+            )
+    return row_of
+
+
+def _not_used(found: Mapping[str, list[Registered]]) -> str:
+    """The first positions that name no image of the model or several, as text; empty for none."""
+    others = [
+        f"{name}, which is {' and '.join(each.name for each in images[:_SHOWN])}"
+        if images
+        else f"{name}, which is no image with a pose"
+        for name, images in found.items()
+        if len(images) != 1
+    ]
+    more = "; ..." if len(others) > _SHOWN else ""
+    return f"not used: {'; '.join(others[:_SHOWN])}{more}" if others else ""
 
 
 def _refuse_outlier(

@@ -123,8 +123,9 @@ def _at_positions(
 ) -> tuple[Similarity, dict[str, Any]]:
     positions = _read_positions(file)
     fit = fit_known_positions(model, positions, ground)
+    not_used = f"; {fit.not_used}" if fit.not_used else ""
     said = (
-        f"metric: known positions of {fit.images} images ({len(positions)} in the file), rms {fit.rms_m:.3g} m, "
+        f"metric: known positions of {fit.images} images ({len(positions)} in the file{not_used}), rms {fit.rms_m:.3g} m, "
         f"worst {fit.worst_m:.3g} m ({fit.worst})"
     ) + _rescaled(fit.similarity.scale, own)
     up = "that of the known positions"

@@ -163,6 +163,27 @@ def test_known_positions_may_leave_out_the_folders_of_images_as_a_length_may(tmp
         np.testing.assert_allclose(frames[name].T_world_from_camera, T, atol=1e-3)
 
 
+def test_two_rows_for_one_image_are_refused_with_both_names(tmp_path):
+    names = [f"walk/{number}.png" for number in range(8)]
+    scan = write(posed([in_colmap(T) for T in RING], names, floor()), tmp_path / "model")
+    known = write_positions(tmp_path / "gps.csv", [*RING, RING[3]], [*names, "3.png"])
+    with pytest.raises(AdvnerfError, match=r"one position for each image, got .*walk/3\.png and 3\.png"):
+        run(tmp_path, scan, write_images(tmp_path / "pictures", names), positions=known)
+
+
+def test_positions_that_name_no_single_image_are_named(tmp_path, ring):
+    names = [*NAMES[:6], "2.png", "typo.png"]
+    run(tmp_path, *ring, positions=write_positions(tmp_path / "gps.csv", RING, names))
+    _, report = loaded(tmp_path)
+    assert "known positions of 6 images (8 in the file; not used: 2.png, which is" in report["scale"]
+    assert "front/2.png and rear/2.png; typo.png, which is no image with a pose)" in report["scale"]
+    ends = write_positions(tmp_path / "ends.csv", RING[:4], [f"{number}.png" for number in range(4)])
+    with pytest.raises(
+        AdvnerfError, match=r"got 0 \(not used: 0\.png, which is front/0\.png and rear/0\.png; "
+    ):
+        run(tmp_path, *ring, positions=ends)
+
+
 @pytest.mark.parametrize("with_floor", [True, False])
 def test_positions_on_a_straight_drive_take_up_from_the_ground_or_the_cameras(tmp_path, with_floor):
     drive = [look_at([0.5 * k, 0.2, 1.2], [0.5 * k + 3.0, 0.2, 1.2]) for k in range(8)]
