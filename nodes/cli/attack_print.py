@@ -146,12 +146,12 @@ def attack_measure(
     from nodes.lab.wizards.prints import KnownLength, measure, measured_files, write_measured
 
     target = output or source.with_name(f"{source.stem}.measured.json")
-    record = load_record(printed)
+    record = load_record(printed, "poster")
     attack_file = attack_file or printed.parent / record.attack_file
     refuse_overwriting((source, printed, camera, card, attack_file, request), measured_files(target))
     attack = load_attack(attack_file)
     known = KnownLength(
-        None if card is None else load_record(card),
+        None if card is None else load_record(card, "chart"),
         distance_m,
         width_m,
         pose_of("--car", car, "1.2,-0.4,3.1"),

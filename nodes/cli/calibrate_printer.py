@@ -64,6 +64,6 @@ def printer(
     from nodes.lab.wizards.lens import load_lens
 
     keep_inputs(output, photo, chart, lens)
-    fit = fit_printer(read_picture(photo), load_lens(lens), load_record(chart))
+    fit = fit_printer(read_picture(photo), load_lens(lens), load_record(chart, "chart"))
     save_and_print(printer_calibration(fit, conditions), output, lambda figure: display_plot(figure, fit))
     print(f"a search prints within this range with\nface: {{display: {output}}}")

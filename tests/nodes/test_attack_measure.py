@@ -23,7 +23,7 @@ from advnerf_core.geometry import (
     rotation_x,
     rotation_z,
 )
-from calibration.print_chart import make_chart
+from calibration.print_chart import chart_record, make_chart
 from calibration.print_colour import ColourError, print_colours
 from calibration.print_markers import find_markers, why_none
 from calibration.print_measurement import WIDTH, of_photograph
@@ -225,6 +225,15 @@ def measuring(folder):
     noise = np.random.default_rng(0).integers(0, 256, (720, 960, 3)).astype(np.uint8)
     write_image(folder / "photo.png", noise)
     return measure_command(folder, "photo.png")
+
+
+def test_the_record_of_a_chart_is_refused_with_the_command_that_writes_the_right_one(call, folder, measuring):
+    save_record(chart_record(make_chart("a4"), 50.0), folder / "p.print.json")
+    for others in ((), ("--attack", folder / "a.attack.safetensors")):
+        code, said = call(*measuring, *others)
+        assert (code, said.count("error:")) == (2, 1)
+        assert "p.print.json: expected the record of a poster, got that of a chart" in said, said
+        assert "that 'advnerf attack print' wrote" in said
 
 
 def test_a_photograph_without_the_print_is_refused(call, measuring):

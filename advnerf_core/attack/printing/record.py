@@ -19,6 +19,8 @@ from advnerf_core.plain import Numbers, PlainData
 
 SUFFIX = ".print.json"
 _LEAST_M, _LARGEST_M, _SAME_M = 0.01, 50.0, 1e-6
+Kind = Literal["poster", "chart"]
+_WRITTEN_BY = {"poster": "advnerf attack print", "chart": "advnerf car calibrate printer-chart"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +40,7 @@ class PrintRecord(PlainData):
     """
 
     _refusal = PrintError
-    kind: Literal["poster", "chart"]
+    kind: Kind
     picture_m: tuple[float, float]
     sheet_m: tuple[float, float]
     dictionary: str
@@ -55,7 +57,7 @@ class PrintRecord(PlainData):
         first = min(self.markers)
         return MarkerFrame(self.picture_m, float(np.ptp(self.markers[first][:, 1])), first)
 
-    def require(self, kind: Literal["poster", "chart"]) -> None:
+    def require(self, kind: Kind) -> None:
         """Refuse the record of the other kind of print.
 
         Raises:
@@ -63,7 +65,8 @@ class PrintRecord(PlainData):
         """
         if self.kind != kind:
             raise PrintError(
-                f"expected the record of a {kind}, got that of a {self.kind}; give the {SUFFIX} that was written beside the {kind}"
+                f"expected the record of a {kind}, got that of a {self.kind}; give the {SUFFIX} that "
+                f"'{_WRITTEN_BY[kind]}' wrote beside the {kind}"
             )
 
     def __post_init__(self) -> None:
@@ -133,16 +136,21 @@ def save_record(record: PrintRecord, path: Path) -> None:
     write_json(path, record.to_dict())
 
 
-def load_record(path: Path) -> PrintRecord:
-    """Read a record.
+def load_record(path: Path, kind: Kind | None = None) -> PrintRecord:
+    """Read a record, of one kind of print if it is given.
 
     Raises:
-        PrintError: The file is missing, damaged, or something else.
+        PrintError: The file is missing, damaged, something else, or of the other kind.
     """
     try:
         found = read_json(path)
         if not isinstance(found, dict):
             raise PrintError(f"expected the record of a print, got a {type(found).__name__}")
-        return PrintRecord.from_dict(found)
+        record = PrintRecord.from_dict(found)
     except (ConfigError, PrintError) as error:
         raise PrintError(f"{path}: {error}; give the {SUFFIX} that was written beside the print") from error
+    try:
+        record.require(kind or record.kind)
+    except PrintError as error:
+        raise PrintError(f"{path}: {error}") from error
+    return record
