@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from advnerf_core.geometry import Array, Pinhole, invert_transform, make_transform
 from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.print_markers import LEAST_MARKERS
-from calibration.print_model import CORRELATED, LEAST_NOISE_PX
+from calibration.print_model import CORRELATED, LEAST_NOISE_PX, shift_lengths_m
 from calibration.print_pose import MOST_ANGLE_RAD, MOST_SHARE, some_pose
 
 _LEAST_VIEWS = 3
@@ -46,7 +46,7 @@ class PlacedPrint:
         rms_px: Root mean square distance of the corners from their projections [px].
         flatness_m: Root mean square distance of the markers from their plane [m].
         flatness_sd_m: Standard deviation of one such distance [m].
-        seen: Numbers of the markers.
+        off_m: Distance of each marker from its place in the print's plane, by number [m].
         views: Number of pictures.
     """
 
@@ -57,7 +57,7 @@ class PlacedPrint:
     rms_px: float
     flatness_m: float
     flatness_sd_m: float
-    seen: tuple[int, ...]
+    off_m: Mapping[int, float]
     views: int
 
 
@@ -101,15 +101,16 @@ def place_print(views: Sequence[PrintView], corners_m: Mapping[int, Array], pinh
             f"{np.degrees(angle_sd):.2f} degrees and {100 * scale_sd:.2f} % from {len(views)} pictures; drive past it at several distances and angles"
         )
     flatness_m, flatness_sd_m = problem.flatness(found.x, noise)
+    scale = float(np.exp(found.x[6]))
     return PlacedPrint(
-        float(np.exp(found.x[6])),
+        scale,
         scale_sd,
         make_transform(cv2.Rodrigues(found.x[:3])[0], found.x[3:6]),
         angle_sd,
         rms_px,
         flatness_m,
         flatness_sd_m,
-        tuple(sorted(problem.numbers)),
+        {number: scale * off for number, off in problem.shift_lengths_m(found.x).items()},
         len(views),
     )
 
@@ -122,6 +123,7 @@ class _Problem:
         self.numbers = sorted({number for view in views for number in view.markers})
         index = {number: k for k, number in enumerate(self.numbers)}
         pairs = [(view, number) for view in views for number in view.markers]
+        self._seen = [number for _, number in pairs]
         self._which = np.array([index[number] for _, number in pairs])
         self._pixels = np.stack([view.markers[number] for view, number in pairs])
         cameras = np.stack([invert_transform(view.T_world_from_camera) for view, _ in pairs])
@@ -129,10 +131,8 @@ class _Problem:
         self._points = np.stack([corners_m[number] for number in self.numbers])
         self._middles = self._points.mean(axis=1, keepdims=True)
 
-    def errors(self, p: Array, off_m: Array | None = None) -> Array:
-        grown = np.exp(p[6]) * (self._middles + (1.0 + p[7]) * (self._points - self._middles))
-        if off_m is not None:
-            grown = grown + off_m[:, None, None] * np.array([1.0, 0.0, 0.0])
+    def errors(self, p: Array, off_m: Array | float = 0.0) -> Array:
+        grown = np.exp(p[6]) * (self._middles + (1.0 + p[7]) * (self._points - self._middles)) + off_m
         world = grown @ cv2.Rodrigues(p[:3])[0].T + p[3:6]
         seen = np.einsum("nij,nkj->nki", self._R, world[self._which]) + self._t[:, None]
         return np.asarray((self._pinhole.project(seen) - self._pixels).ravel())
@@ -140,9 +140,17 @@ class _Problem:
     def fit(self, start: Array) -> Any:
         return least_squares(self.errors, start, x_scale="jac", loss="soft_l1", f_scale=2.0, max_nfev=60)
 
+    def shift_lengths_m(self, p: Array) -> dict[int, float]:
+        """See `print_model.shift_lengths_m`."""
+        scale = np.exp(p[6])
+        return shift_lengths_m(lambda shift: self.errors(p, scale * shift).reshape(-1, 4, 2), self._seen)
+
     def flatness(self, p: Array, noise: float) -> tuple[float, float]:
         """Root mean square distance of the markers from their own plane, and the standard deviation of one [m]."""
-        found = least_squares(lambda off: self.errors(p, off), np.zeros(len(self.numbers)), method="lm")
+        normal = np.array([1.0, 0.0, 0.0])
+        found = least_squares(
+            lambda off: self.errors(p, off[:, None, None] * normal), np.zeros(len(self.numbers)), method="lm"
+        )
         variances = noise * CORRELATED**2 * np.diag(np.linalg.pinv(found.jac.T @ found.jac))
         plane = np.concatenate([self._middles[:, 0, 1:], np.ones((len(self.numbers), 1))], axis=1)
         off = found.x - plane @ np.linalg.lstsq(plane, found.x, rcond=None)[0]

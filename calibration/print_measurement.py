@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,8 @@ CARD, DISTANCE, WIDTH, POSES = "a card", "the distance", "the width", "the camer
 _UPRIGHT_DEG, _LEAST_UPRIGHT = 10.0, 0.5
 # No printer is off by more, but a length in another unit is; and no shade covers so much of a print that was found.
 _LARGEST_OFF, _OTHER_SHARE = 0.3, 0.5
+# A marker stands out by this multiple of the others' median distance, and by more than cutting and gluing with care.
+_STANDS_OUT, _LEAST_OFF_MM = 4.0, 2.0
 _NO_PLACE = (
     "unknown: give the camera file of the car, --car X,Y,YAW, and the size with --card, --distance or --width"
 )
@@ -39,6 +42,7 @@ class PrintMeasurement(PlainData):
         view_angle_deg: Angle at which a photograph shows it; 0 from straight ahead. None of a bag.
         markers_seen: Numbers of the markers that were used.
         markers_dropped: Numbers of those that do not lie where the others put them.
+        markers_off_mm: Distance of each marker that was found from its place in the print's plane, by number [mm].
         markers_printed: Number of markers on the print.
         markers_outside: Number of markers that lie outside a photograph.
         residual_px: Root mean square distance of the corners from where a flat print has them [px].
@@ -60,6 +64,7 @@ class PrintMeasurement(PlainData):
     view_angle_deg: float | None
     markers_seen: tuple[int, ...]
     markers_dropped: tuple[int, ...]
+    markers_off_mm: Mapping[int, float]
     markers_printed: int
     residual_px: float
     residual_mm: float
@@ -114,7 +119,9 @@ class PrintMeasurement(PlainData):
         if (turned := self._turned()) is not None:
             rows.append(("turned", turned))
         rows.append(("direction within", f"{self.angle_sd_deg:.2f} degrees (standard deviation)"))
-        rows.append(("flatness", self._flatness()))
+        flat = f"{self.flatness_mm:.1f} mm from a plane (standard deviation {self.flatness_sd_mm:.1f} mm)"
+        rows.append(("flatness", flat))
+        rows.append(("fit", self._fit()))
         rows.append(("colours", self._colours()))
         return rows
 
@@ -152,9 +159,16 @@ class PrintMeasurement(PlainData):
         of = "" if self.T_world_from_face is not None else " of the photograph"
         return f"by {abs(turned_deg):.0f} degrees {way} against the horizontal{of}: not as it was searched, which is upright; hang it upright"
 
-    def _flatness(self) -> str:
-        off = f"{self.flatness_mm:.1f} mm from a plane (standard deviation {self.flatness_sd_mm:.1f} mm)"
-        return f"{off}, corners within {self.residual_mm:.1f} mm of where that puts them"
+    def _fit(self) -> str:
+        off_mm = self.markers_off_mm
+        worst = max(off_mm, key=off_mm.__getitem__)
+        others_mm = float(np.median([off for number, off in off_mm.items() if number != worst]))
+        text = (
+            f"corners within {self.residual_mm:.1f} mm of where that puts them; marker {worst} is the farthest off, by {off_mm[worst]:.1f} mm, "
+            f"the others by {others_mm:.1f} mm (median)"
+        )
+        apart = off_mm[worst] > max(_STANDS_OUT * others_mm, _LEAST_OFF_MM)
+        return f"{text}: is a part of the print glued off its place?" if apart else text
 
     def _colours(self) -> str:
         if self.colours is None:
@@ -210,6 +224,7 @@ def of_photograph(
         view_angle_deg=float(np.degrees(pose.view_angle_rad)),
         markers_seen=pose.seen,
         markers_dropped=pose.dropped,
+        markers_off_mm={number: 1000.0 * scale * off for number, off in pose.off_m.items()},
         markers_printed=printed,
         residual_px=pose.rms_px,
         residual_mm=1000.0 * pose.rms_m * scale,
@@ -232,8 +247,9 @@ def of_drive(
         T_world_from_face=found.T_world_from_face,
         angle_sd_deg=float(np.degrees(found.angle_sd_rad)),
         view_angle_deg=None,
-        markers_seen=found.seen,
+        markers_seen=tuple(found.off_m),
         markers_dropped=(),
+        markers_off_mm={number: 1000.0 * off for number, off in found.off_m.items()},
         markers_printed=printed,
         residual_px=found.rms_px,
         residual_mm=1000.0 * found.rms_px * distance_px,

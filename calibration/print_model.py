@@ -20,6 +20,7 @@ POSE, GROWTH, ASPECT, BEND = slice(0, 6), 6, 7, slice(8, 11)
 COUNT = 11
 RIGID = tuple(range(7))
 BENT = (*RIGID, 8, 9, 10)
+_STEP_M = 1e-4  # of differences: pixels are nearly linear over such a shift
 # Corners of one marker share the errors of its edges: standard deviations for independent errors are multiplied by this.
 CORRELATED = 2.0
 LEAST_NOISE_PX = 0.05
@@ -83,6 +84,23 @@ def corner_errors(markers: Mapping[int, Array], corners_m: Mapping[int, Array], 
         return pinhole.project(moved(p, laid)) - pixels
 
     return errors
+
+
+def shift_lengths_m(errors: Callable[[Array], Array], numbers: Sequence[int]) -> dict[int, float]:
+    """How far each marker lies from its place in the print's plane, by its number, in nominal metres.
+
+    Args:
+        errors: Errors ``[N, 4, 2]`` [px] of seen markers over a shift ``[3]`` of all of them on the print [m].
+        numbers: Numbers of these N markers; one that is seen several times has the shift that explains it best.
+    """
+    here, *beyond = (errors(_STEP_M * np.array(way)) for way in ((0, 0, 0), (0, 1, 0), (0, 0, 1)))
+    slopes = np.stack([(each - here) / _STEP_M for each in beyond], axis=-1)
+    found = {}
+    for number in sorted(set(numbers)):
+        those = np.array(numbers) == number
+        shift = np.linalg.lstsq(slopes[those].reshape(-1, 2), here[those].ravel(), rcond=None)[0]
+        found[number] = float(np.linalg.norm(shift))
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,6 +33,7 @@ from calibration.print_model import (
     half_side,
     moved,
     parameters,
+    shift_lengths_m,
 )
 
 Seen = tuple[Mapping[int, Array], Mapping[int, Array]]
@@ -56,6 +57,7 @@ class PrintPose:
         laid: Where its points are, with its aspect and bend.
         seen: Numbers of the markers that were used.
         dropped: Numbers of those that were found, and left out, because they do not lie where the others put them.
+        off_m: Distance of each marker that was found from its place in the print's plane, by number.
         rms_px: Root mean square distance of the corners from their projections [px].
         rms_m: The same in the print's plane.
         bend_m: Root mean square distance of the markers from the middle plane, as far as the photograph shows a bend.
@@ -69,6 +71,7 @@ class PrintPose:
     laid: LaidPrint
     seen: tuple[int, ...]
     dropped: tuple[int, ...]
+    off_m: Mapping[int, float]
     rms_px: float
     rms_m: float
     bend_m: float
@@ -121,22 +124,23 @@ def fit_print(
         del kept[worst]
         if len(kept) < LEAST_MARKERS or len(dropped) > _MOST_DROPPED * len(markers):
             raise PoorFitError(
-                f"expected markers in one plane, as printed, got {len(dropped)} of {len(markers)} elsewhere; is the print bent, is this its "
-                ".print.json, and the right lens?"
+                f"expected markers in one plane, as printed, got {len(dropped)} of {len(markers)} elsewhere; is the print bent, is a part of it "
+                "glued off its place, is this its .print.json, and the right lens?"
             )
     fit = _with_aspect(fit, (kept, corners_m), pinhole)
     extent_px = float(np.ptp(np.concatenate(list(kept.values())), axis=0).max())
-    bend, bend_sd = _require_flat(fit, extent_px, kept, corners_m)
+    bend, bend_sd = _require_flat(fit, extent_px, (kept, corners_m), pinhole)
     scale, scale_sd = None, 0.0
     if card is not None:
         fit, scale, scale_sd = _carded(fit, (kept, corners_m), card, pinhole)
-        _require_flat(fit, extent_px, kept, corners_m)
+        _require_flat(fit, extent_px, (kept, corners_m), pinhole)
     distance_sd = _require_sure(fit, scale_sd, len(kept))
     rms_m = fit.rms_px * float(np.linalg.norm(fit.values[3:6])) / pinhole.fx
     return PrintPose(
         LaidPrint(fit.transform, float(fit.values[ASPECT]), fit.values[BEND], half_side(corners_m)),
         tuple(kept),
         tuple(dropped),
+        _off_m(fit, (markers, corners_m), pinhole),
         fit.rms_px,
         rms_m,
         bend,
@@ -211,11 +215,20 @@ def _with_aspect(fit: PrintFit, seen: Seen, pinhole: Pinhole) -> PrintFit:
     return free if believed and free.rms_px < _BETTER * fit.rms_px else fit
 
 
-def _require_flat(
-    fit: PrintFit, extent_px: float, markers: Mapping[int, Array], corners_m: Mapping[int, Array]
-) -> tuple[float, float]:
+def _off_m(fit: PrintFit, seen: Seen, pinhole: Pinhole) -> dict[int, float]:
+    markers, corners_m = seen
+
+    def errors(shift_m: Array) -> Array:
+        shifted = {number: corners + shift_m for number, corners in corners_m.items()}
+        return corner_errors(markers, shifted, pinhole)(fit.values[:COUNT])
+
+    return shift_lengths_m(errors, list(markers))
+
+
+def _require_flat(fit: PrintFit, extent_px: float, seen: Seen, pinhole: Pinhole) -> tuple[float, float]:
     """Root mean square bend at the markers and its standard deviation, in nominal metres; an error if it is too large."""
     most_px = max(_MOST_RMS_PX, _MOST_RMS_SHARE * extent_px)
+    markers, corners_m = seen
     half_m = half_side(corners_m)
     at = np.concatenate([corners_m[number] for number in markers]) / half_m
     terms = np.stack([bend_m(row, at) for row in np.eye(3)], axis=-1)
@@ -224,9 +237,12 @@ def _require_flat(
     ))  # fmt: skip
     bend = float(np.abs(fit.values[BEND]).max())
     if fit.rms_px > most_px or bend > _MOST_BEND * half_m:
+        off_m = _off_m(fit, seen, pinhole)
+        worst = max(off_m, key=off_m.__getitem__)
         raise PoorFitError(
             f"expected markers in one plane within {most_px:.1f} px and a bend below {100 * _MOST_BEND:.0f} % of half a side, got {fit.rms_px:.1f} px and "
-            f"{100 * bend / half_m:.0f} %; is the print bent, is this its .print.json, and the right lens?"
+            f"{100 * bend / half_m:.0f} %, the farthest, marker {worst}, {1000 * off_m[worst]:.1f} mm off; is the print bent, is a part of it glued off its "
+            "place, is this its .print.json, and the right lens?"
         )
     return off, off_sd
 

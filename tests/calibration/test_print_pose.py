@@ -9,9 +9,11 @@ import pytest
 from advnerf_core.attack.printing.frame import CHART_SET, frame_around
 from advnerf_core.attack.printing.poster import Printable
 from advnerf_core.data.similarity import rotation_angles
-from advnerf_core.geometry import make_transform, rotation_x
+from advnerf_core.geometry import invert_transform, make_transform, rotation_x, transform_points
 from calibration.degeneracy import DegenerateDataError, PoorFitError
+from calibration.print_drive import PrintView, place_print
 from calibration.print_markers import find_markers, why_none
+from calibration.print_measurement import of_drive, of_photograph
 from calibration.print_pose import fit_print
 from calibration.schema import CalibrationError
 from tests.support.photographed import before_camera, lens, photograph, scaled
@@ -141,3 +143,55 @@ def test_markers_of_a_swapped_print_do_not_fit():
     markers = find_markers(image, LENS, wide.corners_m)
     with pytest.raises(PoorFitError, match=r"is this its \.print\.json"):
         fit_print(markers, wide.corners_m, LENS.pinhole)
+
+
+def seen_corners(T_camera_from_face, moved_m, rng):
+    """Pixels of all markers through the pinhole, with noise; ``moved_m`` are shifts ``[3]`` of some of them on the sheet."""
+    found = {}
+    for number, corners in FRAME.corners_m.items():
+        glued = corners + np.array(moved_m.get(number, (0.0, 0.0, 0.0)))
+        pixels = LENS.pinhole.project(transform_points(T_camera_from_face, glued))
+        found[number] = pixels + rng.normal(0.0, 0.05, pixels.shape)
+    return found
+
+
+def measured_photograph(moved_m):
+    markers = seen_corners(before_camera(0.7, 20, 8, 3), moved_m, np.random.default_rng(0))
+    pose = fit_print(markers, FRAME.corners_m, LENS.pinhole)
+    return of_photograph("p.png", (0.3, 0.3), len(FRAME.corners_m), pose, ("the width", 1.1, 0.0), None)
+
+
+def measured_drive(moved_m):
+    rng, views = np.random.default_rng(0), []
+    for k, turn_deg in enumerate(np.linspace(-30, 30, 7)):
+        T = before_camera(0.5 + 0.05 * k, turn_deg, 5)
+        T_world_from_camera = invert_transform(T)
+        T_world_from_camera[:3, 3] *= 1.1
+        views.append(PrintView(seen_corners(T, moved_m, rng), T_world_from_camera))
+    placed = place_print(views, FRAME.corners_m, LENS.pinhole)
+    return of_drive("bag", (0.3, 0.3), len(FRAME.corners_m), placed, 0.001)
+
+
+@pytest.mark.parametrize("measured", [measured_photograph, measured_drive])
+@pytest.mark.parametrize("shift_mm", [(12.0, 0.0), (0.0, -12.0)])
+def test_a_marker_that_is_glued_off_its_place_is_named_with_its_distance(measured, shift_mm):
+    """The print is a tenth larger than it says, and so is the distance."""
+    number = max(FRAME.corners_m)
+    found = measured({number: (0.0, *np.multiply(shift_mm, 0.001))})
+    off = found.markers_off_mm
+    assert max(off, key=off.get) == number
+    assert off[number] == pytest.approx(1.1 * 12.0, abs=1.3)
+    said = dict(found.lines)["fit"]
+    assert f"marker {number} is the farthest off, by 1" in said
+    assert "is a part of the print glued off its place?" in said
+    right = dict(measured({}).lines)["fit"]
+    assert "is the farthest off, by 0." in right
+    assert "glued" not in right
+
+
+def test_a_print_in_parts_that_do_not_meet_is_refused_with_the_worst_marker():
+    right_half = [number for number, corners in FRAME.corners_m.items() if corners[:, 1].mean() > 0.0]
+    with pytest.raises(
+        PoorFitError, match=r"the farthest, marker \d+, \d+\.\d mm off; .*glued off its place"
+    ):
+        measured_photograph(dict.fromkeys(right_half, (0.0, 0.0, 0.012)))

@@ -390,7 +390,7 @@ def test_a_yaw_in_degrees_is_refused(call, measuring):
 
 
 def test_no_picture_of_an_earlier_measurement_stays(tmp_path):
-    pose = PrintPose(LaidPrint(before_camera(0.9)), (1, 2, 3), (), *[0.0] * 6)
+    pose = PrintPose(LaidPrint(before_camera(0.9)), (1, 2, 3), (), dict.fromkeys((1, 2, 3), 0.0), *[0.0] * 6)
     measurement = of_photograph("p.png", (0.4, 0.4), 12, pose, None, None)
     (tmp_path / "p.measured.png").touch()
     target = tmp_path / "p.measured.json"
@@ -415,7 +415,7 @@ def test_a_print_that_does_not_hang_upright_is_said_to_be_turned(roll_deg, tilt_
     T = before_camera(0.9, 35, tilt_deg) @ make_transform(rotation_x(np.radians(roll_deg)), np.zeros(3))
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     T_world_from_camera = planar_pose(1.0, 2.0, 0.7) @ make_transform(level, [0.1, 0.0, 0.2])
-    pose = PrintPose(LaidPrint(T), (1, 2, 3), (), *[0.0] * 6)
+    pose = PrintPose(LaidPrint(T), (1, 2, 3), (), dict.fromkeys((1, 2, 3), 0.0), *[0.0] * 6)
     for known, where in ((None, "of the photograph"), ((WIDTH, 1.0, 0.0), "the horizontal: ")):
         found = of_photograph("p.png", (0.4, 0.4), 12, pose, known, T_world_from_camera)
         said = dict(found.lines).get("turned", "")
@@ -426,7 +426,7 @@ def test_a_print_that_does_not_hang_upright_is_said_to_be_turned(roll_deg, tilt_
 
 
 def test_what_cannot_be_right_or_is_not_known_is_said():
-    pose = PrintPose(LaidPrint(before_camera(0.9)), (1, 2, 3), (), *[0.0] * 6)
+    pose = PrintPose(LaidPrint(before_camera(0.9)), (1, 2, 3), (), dict.fromkeys((1, 2, 3), 0.0), *[0.0] * 6)
     for scale, doubtful in ((0.8, False), (1.2, False), (9.99, True), (3.28, True), (0.1, True)):
         found = of_photograph("p.png", (0.4, 0.4), 12, pose, (WIDTH, scale, 0.0), None)
         assert ("in m?" in dict(found.lines)["size"]) == doubtful
