@@ -35,6 +35,8 @@ MIN_VIEWS = 20
 _MOST_RMS_PX = 0.5
 # A smaller share of the picture's 8 x 6 cells with a corner in it is refused.
 _LEAST_COVERAGE = 0.6
+# Pixels of sensors are square to a few parts in a thousand. A ratio farther from 1 is noted if it is beyond its noise.
+_SQUARE, _SURE = 0.007, 4.0
 # Multiple of the median error beyond which an image is excluded.
 _OUTLIER_FACTOR = 3.0
 
@@ -118,6 +120,18 @@ def calibrate_intrinsics(
     coverage = _coverage([view for view, keep in zip(views, used, strict=True) if keep], size)
     _require_coverage(coverage)
     return IntrinsicsFit(_calibration(fit, size, model, coverage), coverage, used, rms, fit.errors_px)
+
+
+def pixel_shape_warning(lens: LensCalibration) -> str:
+    """A warning if the focal lengths of a fit differ as those of no usual sensor; empty if they do not."""
+    ratio, residuals = lens.fx / lens.fy, lens.residuals
+    sd = np.hypot(residuals["fx_stddev_px"] / lens.fx, residuals["fy_stddev_px"] / lens.fy)
+    if abs(ratio - 1.0) <= max(_SQUARE, _SURE * sd):
+        return ""
+    return (
+        f"warning: expected fx / fy of 1, as of square pixels, but it is {ratio:.3f}: measure squares of the board along both sides, and print it "
+        "again if it was stretched along one; a sensor whose pixels are not square, or pictures that were scaled in one direction, do the same"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -115,7 +115,7 @@ def intrinsics(
     """Calibrate focal length, principal point and distortion from images of a ChArUco board."""
     from calibration.charuco import BoardDetector
     from calibration.degeneracy import DegenerateDataError
-    from calibration.intrinsics import MIN_VIEWS, calibrate_intrinsics, distinct
+    from calibration.intrinsics import MIN_VIEWS, calibrate_intrinsics, distinct, pixel_shape_warning
     from calibration.plots import intrinsics_plot
     from calibration.schema import CalibrationError
     from nodes.lab.wizards.bags import IMAGES, read_pictures
@@ -146,6 +146,8 @@ def intrinsics(
         )
     fit = calibrate_intrinsics(different[::step], size, model)  # type: ignore[arg-type]
     save_and_print(fit.calibration, output, lambda figure: intrinsics_plot(figure, fit))
+    if warning := pixel_shape_warning(fit.calibration):
+        print(warning)
 
 
 @app.command("camera-to-car")

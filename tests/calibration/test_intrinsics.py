@@ -9,7 +9,7 @@ from advnerf_core.errors import ConfigError
 from calibration import intrinsics
 from calibration.charuco import Board, BoardDetector
 from calibration.degeneracy import DegenerateDataError, PoorFitError
-from calibration.intrinsics import calibrate_intrinsics, distinct
+from calibration.intrinsics import calibrate_intrinsics, distinct, pixel_shape_warning
 from calibration.measured import LensCalibration
 from calibration.schema import CalibrationError, load_calibration, save_calibration
 from tests.support.boards import BOARD, board_views
@@ -48,6 +48,25 @@ def test_a_camera_that_few_tilted_pictures_fix_is_found(seed):
     found = calibrate_intrinsics([*flat, *tilted], size).calibration
     assert found.fx == pytest.approx(700.0, rel=0.02)
     assert found.rms_px < 0.2
+
+
+@pytest.mark.parametrize(("stretch", "warned"), [(1.02, "1.019"), (1.0, None)])
+def test_a_board_that_was_stretched_along_one_side_is_noticed(stretch, warned):
+    """All of its errors go into the ratio of the focal lengths, and the reprojection error looks well."""
+    square = np.diag([350.0, 350.0, 1.0]) + np.array([[0, 0, 338.2], [0, 0, 187.1], [0, 0, 0]])
+    views = board_views(np.random.default_rng(1), 30, square, DISTORTION, SIZE, noise_px=0.3)
+    thought = [replace(each, board_m=each.board_m / [stretch, 1.0, 1.0]) for each in views]
+    said = pixel_shape_warning(calibrate_intrinsics(thought, SIZE).calibration)
+    assert (f"is {warned}" in said and "stretched" in said) if warned else said == ""
+
+
+def test_the_pixel_shape_of_a_real_camera_or_an_unsure_fit_is_not_warned_of(views):
+    found = calibrate_intrinsics(views, SIZE).calibration  # 0.4 % from square
+    assert pixel_shape_warning(found) == ""
+    unsure = {**found.residuals, "fx_stddev_px": 5.0}
+    wide = found.model_copy(update={"fx": 360.0})
+    assert pixel_shape_warning(wide)
+    assert pixel_shape_warning(wide.model_copy(update={"residuals": unsure})) == ""
 
 
 def test_copies_and_a_board_that_stands_still_count_once(views):

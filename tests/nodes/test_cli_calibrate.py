@@ -226,6 +226,7 @@ def test_intrinsics_from_a_folder_then_refused_with_half_of_it(tmp_path, capsys)
     assert found.fx == pytest.approx(PINHOLE.fx, rel=0.01)
     assert found.cx == pytest.approx(168.0, abs=1.5)
     assert found.rms_px < 0.3
+    assert "warning" not in capsys.readouterr().out
     for file in sorted(folder.glob("*.png"))[15:]:
         file.unlink()
     capsys.readouterr()
