@@ -35,6 +35,10 @@ _LARGE_PX = 4_000_000
 _DIRECTIONS, _MOST_PIXELS = 36, 500_000
 
 
+class SeenTwiceError(DegenerateDataError):
+    """A photograph shows a marker of the print twice."""
+
+
 def linear(rgb: ArrayLike) -> Array:
     """Linear light in 0..1 of sRGB colours in 0..255."""
     return to_linear(np.asarray(rgb, np.float64) / 255.0)
@@ -51,7 +55,8 @@ def find_markers(
         what: Name of the sheet, for messages.
 
     Raises:
-        DegenerateDataError: A marker is seen twice, or the edges of most are too blurred or too small.
+        SeenTwiceError: A marker is seen twice.
+        DegenerateDataError: The edges of most are too blurred or too small.
     """
     grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)
     # Small markers are found in an enlarged picture.
@@ -66,8 +71,8 @@ def find_markers(
         if number not in wanted:
             continue
         if found.count(number) > 1:
-            raise DegenerateDataError(
-                f"expected one print in the photograph, got marker {number} {found.count(number)} times; cover the other one"
+            raise SeenTwiceError(
+                f"expected one print, got marker {number} {found.count(number)} times in a picture; cover the other one"
             )
         rough = (pixels.reshape(4, 2).astype(np.float64) + 0.5) / times - 0.5
         marker = _located(light, lens, rough)

@@ -296,11 +296,55 @@ def searched(tmp_path_factory):
     return file, attack
 
 
-def seen_by_car(poster_sheet, T_world_from_face, car, camera):
-    T = invert_transform(planar_pose(*car) @ camera.mount) @ T_world_from_face
-    return photograph(
-        [(poster_sheet, T)], camera, noise=1.0, blur_px=0.5, supersampling=3, light=(0.9, 0.9, 0.9)
+def seen_by_car(sheets, car, camera):
+    """A picture of sheets at their ``T_world_from_face``."""
+    T_camera_from_world = invert_transform(planar_pose(*car) @ camera.mount)
+    before = [(sheet, T_camera_from_world @ T) for sheet, T in sheets]
+    return photograph(before, camera, noise=1.0, blur_px=0.5, supersampling=3, light=(0.9, 0.9, 0.9))
+
+
+def write_drive(bag, frames, paint):
+    """A bag of a drive towards the print, with what ``paint`` makes of the car's poses."""
+    with BagWriter(bag) as writer:
+        for k, s in enumerate(np.linspace(0.0, 1.0, frames)):
+            car = (-0.9 + 0.7 * s, -1.9 + 0.5 * s, 0.1 - 0.15 * s)
+            stamp = START_NS + round(1e8 * k)
+            writer.write(
+                "/camera/image_raw", encode(image_message(paint(car), stamp, "camera")), stamp, stamp, k
+            )
+            for step in (-1, 1):
+                pose = encode(pose_message(planar_pose(*car), stamp + step * 1000))
+                writer.write("/vicon/car", pose, stamp + step * 1000, stamp + step * 1000, 2 * k + (step > 0))
+
+
+def test_a_drive_past_two_copies_of_a_print_is_refused(call, folder):
+    """Also where a half of the pictures shows one of them only."""
+    assert (
+        call(
+            "attack",
+            "print",
+            folder / "a.attack.safetensors",
+            "-o",
+            folder / "p.png",
+            "--dpi",
+            50,
+            "--marker-mm",
+            100,
+        )[0]
+        == 0
     )
+    camera = load_calibration(CameraCalibration, CALIBRATION / "camera.yaml")
+    sheet = scaled(poster_of(load_attack(folder / "a.attack.safetensors")).with_markers(0.1), 1.0, 1.0, 60.0)
+    copies = [(sheet, make_transform(rotation_z(3.1), [1.0, y_m, 0.4])) for y_m in (-1.3, -2.1)]
+
+    def paint(car):
+        return seen_by_car(copies if car[0] < -0.5 else copies[:1], car, camera)
+
+    write_drive(folder / "bag", 4, paint)
+    files = "--print", folder / "p.print.json", "--camera", CALIBRATION / "camera.yaml"
+    code, said = call("attack", "measure", folder / "bag", *files)
+    assert (code, "expected one print, got marker" in said) == (2, True), said
+    assert "cover the other one" in said
 
 
 def test_a_drive_gives_size_pose_flatness_and_the_effect_where_it_hangs(call, searched, tmp_path):
@@ -310,15 +354,7 @@ def test_a_drive_gives_size_pose_flatness_and_the_effect_where_it_hangs(call, se
     sheet = poster_of(load_attack(file)).with_markers(0.15)
     scale, T = 1.02, make_transform(rotation_z(3.0), [1.3, -1.6, 0.45])
     printed = scaled(sheet, scale, scale, 60.0)
-    with BagWriter(tmp_path / "bag") as writer:
-        for k, s in enumerate(np.linspace(0.0, 1.0, 9)):
-            car = (-0.9 + 0.7 * s, -1.9 + 0.5 * s, 0.1 - 0.15 * s)
-            stamp = START_NS + round(1e8 * k)
-            rgb = seen_by_car(printed, T, car, camera)
-            writer.write("/camera/image_raw", encode(image_message(rgb, stamp, "camera")), stamp, stamp, k)
-            for step in (-1, 1):
-                pose = encode(pose_message(planar_pose(*car), stamp + step * 1000))
-                writer.write("/vicon/car", pose, stamp + step * 1000, stamp + step * 1000, 2 * k + (step > 0))
+    write_drive(tmp_path / "bag", 9, lambda car: seen_by_car([(printed, T)], car, camera))
     code, said = call(
         "attack", "measure", tmp_path / "bag", "--print", tmp_path / "p.print.json", "--camera", CALIBRATION / "camera.yaml",
         "--request", request, "-o", tmp_path / "found.json",

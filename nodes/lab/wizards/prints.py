@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from advnerf_core.plugins import unknown
 from calibration.degeneracy import DegenerateDataError
 from calibration.print_colour import PrintColours, in_picture, picture_points, print_colours
 from calibration.print_drive import PrintView, place_print
-from calibration.print_markers import find_markers, why_none
+from calibration.print_markers import SeenTwiceError, find_markers, why_none
 from calibration.print_measurement import (
     CARD,
     DISTANCE,
@@ -41,6 +41,8 @@ from nodes.lab.wizards.lens import load_lens
 Rgb = NDArray[np.uint8]
 _MOST_VIEWS = 60
 _MOST_GAP_S = 0.15
+# Beyond this share of a drive's pictures, a marker that is seen twice is no wrong detection.
+_MOST_TWICE = 0.1
 # Of a length read from a ruler or tape, as a share.
 _RULER_SD = 0.002
 
@@ -210,18 +212,18 @@ def _measure_photograph(
 def _measure_drive(
     bag: Path, record: PrintRecord, sheet: Printable, camera: CameraCalibration
 ) -> MeasuredPrint:
-    recorded, views, stamps = read_poses(bag, CAR), [], []
+    recorded, views, stamps, refused = read_poses(bag, CAR), list[PrintView](), list[int](), []
     poses = PoseBuffer.of_recording(zip(recorded.stamps_ns.tolist(), recorded.T, strict=True), _MOST_GAP_S)
     for stamp, rgb in read_frames(bag):
         _require_size(rgb, camera, bag.name)
         pose = poses.at(stamp)
-        if pose is not None and (markers := _seen(rgb, camera, record.markers)):
-            views.append(PrintView(markers, pose.T @ camera.mount))
-            stamps.append(stamp)
-    if not views:
-        raise DegenerateDataError(
-            f"{bag}: expected pictures of the print from known poses of {CAR}, got none; drive nearer, or print larger markers"
-        )
+        try:
+            if pose is not None and (markers := find_markers(rgb, camera, record.markers)):
+                views.append(PrintView(markers, pose.T @ camera.mount))
+                stamps.append(stamp)
+        except DegenerateDataError as error:  # of a drive, blurred and distant pictures are left out
+            refused.append(error)
+    _require_views(bag, len(views), refused)
     placed = place_print(thinned(views, _MOST_VIEWS), record.markers, camera.pinhole)
     poses_before = [invert_transform(each.T_world_from_camera) @ placed.T_world_from_face for each in views]
     for T in poses_before:
@@ -273,11 +275,16 @@ def _with_colours(
     return MeasuredPrint(replace(found, colours=colours.error), colours, by_car)
 
 
-def _seen(rgb: Rgb, lens: Intrinsics, wanted: Mapping[int, Array]) -> dict[int, Array]:
-    try:
-        return find_markers(rgb, lens, wanted)
-    except DegenerateDataError:  # of a drive, blurred and distant pictures are left out
-        return {}
+def _require_views(bag: Path, views: int, refused: Sequence[DegenerateDataError]) -> None:
+    """Refuse a drive whose pictures show no print, or two of one kind; ``refused`` are the errors of those that were left out."""
+    twice = [error for error in refused if isinstance(error, SeenTwiceError)]
+    if len(twice) > _MOST_TWICE * (views + len(twice)):
+        raise DegenerateDataError(f"{bag}: {twice[0]}")
+    if not views:
+        why = f" ({len(refused)} were left out, the first for this: {refused[0]})" if refused else ""
+        raise DegenerateDataError(
+            f"{bag}: expected pictures of the print from known poses of {CAR}, got none{why}; drive nearer, or print larger markers"
+        )
 
 
 def _require_size(rgb: Rgb, lens: Intrinsics, name: str) -> None:
