@@ -35,6 +35,7 @@ _LEAST_UPPER = 0.85
 _DEPTH_TO_LOOK_AT = 0.97
 # A largest depth that so many pixels have to the bit, before the car moves ahead and after, is no surface.
 _SATURATED_SHARE = 0.01
+_ROWS_OF_GROUND = 2
 _SAME_COLOUR, _SAME_COLOUR_SHARE = 4.0, 0.2
 _EVERY_PX = 3
 # The second view of a pair: ahead by this many seconds of driving, aside by a share of half a lane, turned [rad].
@@ -358,7 +359,9 @@ def _require_unsaturated(here: Depth, ahead: Depth) -> None:
     """Raise for views before and after a move ahead in which many pixels share one largest depth: a surface would have come nearer."""
     farthest_m, also_m = (float(np.max(each, initial=0.0, where=np.isfinite(each))) for each in (here, ahead))
     share = min(float(np.mean(each == farthest_m)) for each in (here, ahead))
-    if farthest_m == also_m and share > _SATURATED_SHARE:
+    # Flat ground up to the horizon ends in one row of pixels, whose planar depth is the same wherever the car stands.
+    rows = int((here == farthest_m).any(axis=1).sum())
+    if farthest_m == also_m and share > _SATURATED_SHARE and rows > _ROWS_OF_GROUND:
         raise NotMet(
             f"expected infinite depth where nothing is measured; {100 * share:.0f} % of a view is at its largest depth, {farthest_m:g} m, and stays there as the "
             "car drives ahead: the camera ends there; give infinity where nothing is measured"

@@ -18,7 +18,7 @@ from nodes.runtime.errors import ConfigError
 TINY = {
     "gate": None,
     "capture": {"photos": 40, "held_out": 3},
-    "scene": {"steps": 60, "log2_entries": 10, "finest": 32, "occupancy": 16},
+    "scene": {"steps": 400, "log2_entries": 10, "finest": 32, "occupancy": 16},
     "object": {"car_resolution": 12, "hydrant_resolution": 10, "fit_steps": 0},
     "policy": {
         "deployed_stills": 2, "surrogate_stills": 2, "deployed_drives": 1, "surrogate_drives": 1, "drive_steps": 2, "dagger_rounds": 1,

@@ -15,7 +15,6 @@ def named(library, settings):
     )
 
 
-@pytest.mark.slow
 def test_a_good_server(named, library):
     findings = check_world(named)
     assert [f"{finding.name}: {finding.text}" for finding in findings if not finding.met] == []
