@@ -29,6 +29,7 @@ from calibration.photo_model import (
     Report,
     SfmConfig,
 )
+from calibration.zoomed import own_focal_lengths, require_one_focal_length
 
 # Shares of the wall time, roughly: features, matches, poses, lenses.
 _FEATURES_UNTIL, _MATCHES_UNTIL, _POSES_UNTIL = 0.25, 0.65, 0.93
@@ -74,6 +75,8 @@ def _find_model(
     choices, why = choose_lenses(
         best, held, database.exif_focal_lengths(file), _part(report, _POSES_UNTIL, 1.0)
     )
+    own = own_focal_lengths(best, held)
+    require_one_focal_length({cameras[number]: images for number, images in own.items()})
     elsewhere = "it could not be placed: too little overlap with the others, or blur"
     why |= {name: elsewhere for name in names if name not in placed}
     _write_finished(work, best, parts, choices, why)

@@ -102,19 +102,19 @@ def choose_lenses(
     Returns:
         The choice for each remaining camera, and the reason for each image that was removed.
     """
-    images = _images_of(reconstruction)
+    images = images_of(reconstruction)
     known = {number: LensChoice("OPENCV", "known, held") for number in images if number in held}
     unknown = [number for number in images if number not in held]
     if not unknown:
         return known, {}
-    scale_px = _typical_error_px(reconstruction)
+    scale_px = typical_error_px(reconstruction)
     chosen = _by_evidence(reconstruction, unknown, held, scale_px, report)
     constant, left_out = set(held), dict[str, str]()
-    while chosen and sum(map(len, _images_of(reconstruction).values())) >= MIN_IMAGES:
+    while chosen and sum(map(len, images_of(reconstruction).values())) >= MIN_IMAGES:
         report(0.8, "bundle adjustment with the chosen lenses")
         for number, choice in chosen.items():
-            _set_model(reconstruction.cameras[number], choice.model)
-        errors = _adjust(reconstruction, constant, scale_px, with_errors=True)
+            set_model(reconstruction.cameras[number], choice.model)
+        errors = adjust(reconstruction, constant, scale_px, with_errors=True)
         problems = {
             number: why for number in chosen if (why := _problem(reconstruction, number, errors.get(number)))
         }
@@ -146,7 +146,7 @@ def choose_lenses(
     return known | chosen, left_out
 
 
-def _images_of(reconstruction: Any) -> dict[int, list[Any]]:
+def images_of(reconstruction: Any) -> dict[int, list[Any]]:
     """Images that have a pose, by camera, both in order of their numbers."""
     found: dict[int, list[Any]] = {}
     for image in sorted(
@@ -160,7 +160,7 @@ def _residuals_px(reconstruction: Any) -> dict[int, NDArray[np.float64]]:
     """Distances of all observations from their points' projections [px], by camera."""
     place = {number: point.xyz for number, point in reconstruction.points3D.items()}
     found = {}
-    for number, images in _images_of(reconstruction).items():
+    for number, images in images_of(reconstruction).items():
         pinhole, lens = intrinsics(reconstruction.cameras[number])
         parts = []
         for image in images:
@@ -174,7 +174,7 @@ def _residuals_px(reconstruction: Any) -> dict[int, NDArray[np.float64]]:
     return found
 
 
-def _typical_error_px(reconstruction: Any) -> float:
+def typical_error_px(reconstruction: Any) -> float:
     """Standard deviation of an observation along one axis [px], from the median: outliers do not count."""
     distances = np.concatenate(list(_residuals_px(reconstruction).values()))
     return max(float(np.median(distances)) / math.sqrt(2.0 * math.log(2.0)), 0.05) if len(distances) else 1.0
@@ -184,7 +184,7 @@ def _by_evidence(
     reconstruction: Any, unknown: Collection[int], held: Collection[int], scale_px: float, report: Report
 ) -> dict[int, LensChoice]:
     """The choice of each camera: every model is fitted to a copy, to all cameras with enough images for it at once."""
-    images = {number: len(each) for number, each in _images_of(reconstruction).items()}
+    images = {number: len(each) for number, each in images_of(reconstruction).items()}
     criteria: dict[int, dict[str, float]] = {number: {} for number in unknown}
     for index, (model, parameters, fewest) in enumerate(_MODELS):
         tried = [number for number in unknown if images[number] >= fewest]
@@ -193,8 +193,8 @@ def _by_evidence(
         report(0.8 * index / len(_MODELS), f"is {model} the lens?")
         fitted = copy.deepcopy(reconstruction)
         for number in tried:
-            _set_model(fitted.cameras[number], model)
-        _adjust(fitted, held, scale_px)
+            set_model(fitted.cameras[number], model)
+        adjust(fitted, held, scale_px)
         for number, distances in _residuals_px(fitted).items():
             if number in tried and nonsense(*intrinsics(fitted.cameras[number])) is None:
                 criteria[number][model] = _criterion(distances, parameters, scale_px)
@@ -225,7 +225,7 @@ def _simplest(criteria: Mapping[str, float], images: int) -> LensChoice:
     return LensChoice(best or "SIMPLE_PINHOLE", f"{'; '.join(said)} ({_EVIDENCE:.0f} decides)")
 
 
-def _set_model(camera: Any, model: str) -> None:
+def set_model(camera: Any, model: str) -> None:
     """Change a camera's model; parameters of both models are kept."""
     import pycolmap
 
@@ -250,7 +250,7 @@ def _set_focal_length(camera: Any, focal_px: float) -> None:
     camera.params = params
 
 
-def _adjust(
+def adjust(
     reconstruction: Any, constant: Collection[int], scale_px: float, with_errors: bool = False
 ) -> dict[int, float]:
     """Bundle adjustment, principal points held; if wanted, standard errors of the refined focal lengths [%] by camera."""
@@ -261,7 +261,7 @@ def _adjust(
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = math.sqrt(_DEGREES_OF_FREEDOM) * scale_px
     options.ceres.solver_options.num_threads = 1  # sums over threads in another order end in another model
-    images = _images_of(reconstruction)
+    images = images_of(reconstruction)
     for number, each in images.items():
         for image in each:
             config.add_image(image.image_id)
@@ -293,7 +293,7 @@ def _problem(reconstruction: Any, number: int, focal_error_percent: float | None
 
 def _take_out(reconstruction: Any, number: int, why: str) -> dict[str, str]:
     """Remove the images of a camera; the reason by their names."""
-    images = _images_of(reconstruction)[number]
+    images = images_of(reconstruction)[number]
     names = {image.name: int(image.frame_id) for image in images}
     for frame in names.values():
         reconstruction.deregister_frame(frame)
