@@ -44,6 +44,8 @@ class Renderer:
         self._range_m = range_m
         self._model, self._scale = model, supersampling
         self._gl = create_context(64, 64)
+        # Shadows are switched off below: no 64 MiB for a map of them, which a software rasteriser also has to clear.
+        model.vis.quality.shadowsize = 0
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         # Runs at exit too, and there before MuJoCo's own handler, registered earlier, ends the display.
         self._free = weakref.finalize(self, _free, self._gl, self._context)

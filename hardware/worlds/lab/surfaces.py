@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -9,8 +10,8 @@ import numpy as np
 
 from advnerf_core.geometry import Array
 from hardware.worlds.lab import lighting, textures
-from hardware.worlds.lab.config import LabConfig
-from hardware.worlds.lab.furniture import furnish
+from hardware.worlds.lab.config import Colour, LabConfig, RoomConfig
+from hardware.worlds.lab.furniture import Solid, furnish
 from hardware.worlds.lab.textures import Image
 
 UP, EAST, NORTH = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
@@ -44,14 +45,20 @@ class Surface:
         return np.asarray(np.cross(self.right, self.up), dtype=np.float64)
 
 
-@lru_cache(maxsize=2)
 def paint_room(config: LabConfig) -> tuple[dict[str, Surface], Image]:
-    """Paint floor, ceiling and walls and bake their light; a second lab of the same configuration reuses them.
+    """Paint floor, ceiling and walls and bake their light; a second lab of the same room reuses them, whatever its cameras are.
 
     Returns:
         The surfaces by name, and the lit tape colour as a picture over the whole floor.
     """
-    room, half, middle = config.room, 0.5 * config.room.side_m, 0.5 * config.room.height_m
+    return _painted(config.room, config.track.tape_rgb, tuple(furnish(config)) if config.shadows else ())
+
+
+@lru_cache(maxsize=2)
+def _painted(
+    room: RoomConfig, tape_rgb: Colour, occluders: tuple[Solid, ...]
+) -> tuple[dict[str, Surface], Image]:
+    half, middle = 0.5 * room.side_m, 0.5 * room.height_m
     rng = np.random.default_rng(room.seed)
     floor = textures.floor_image(room.side_m, rng)
     walls = textures.wall_images(room.side_m, room.height_m, rng)
@@ -63,26 +70,25 @@ def paint_room(config: LabConfig) -> tuple[dict[str, Surface], Image]:
     for name, inward in (("south", NORTH), ("east", -EAST), ("north", -NORTH), ("west", EAST)):
         right = np.asarray(np.cross(UP, inward), dtype=np.float64)
         surfaces.append(Surface(name, middle * UP - half * inward, right, UP, (half, middle), walls[name]))
-    tape: Image = np.full((TAPE_PIXELS, TAPE_PIXELS, 3), config.track.tape_rgb, dtype=np.float32)
+    tape: Image = np.full((TAPE_PIXELS, TAPE_PIXELS, 3), tape_rgb, dtype=np.float32)
     lit = {}
     for surface in surfaces:
         if surface.name == "ceiling":
             lit[surface.name] = surface
             continue
-        light = _light(config, surface)
+        light = _light(room, surface, occluders)
         lit[surface.name] = replace(surface, image=textures.with_light(surface.image, light))
         if surface.name == "floor":
             tape = textures.with_light(tape, light)
     return lit, tape
 
 
-def _light(config: LabConfig, surface: Surface) -> Array:
+def _light(room: RoomConfig, surface: Surface, occluders: Sequence[Solid]) -> Array:
     """Coarse map ``[h, w]`` of the light on a surface, row 0 on top."""
-    lamps = lighting.lamp_samples(0.5 * config.room.side_m, config.room.height_m)
-    cell = config.room.side_m / LIGHT_CELLS
+    lamps = lighting.lamp_samples(0.5 * room.side_m, room.height_m)
+    cell = room.side_m / LIGHT_CELLS
     columns, rows = (max(round(2.0 * half / cell), 1) for half in surface.half_m)
     u = ((np.arange(columns) + 0.5) / columns * 2.0 - 1.0) * surface.half_m[0]
     v = (1.0 - (np.arange(rows) + 0.5) / rows * 2.0) * surface.half_m[1]
     points = surface.centre_m + u[None, :, None] * surface.right + v[:, None, None] * surface.up
-    occluders = furnish(config) if config.shadows else []
     return lighting.irradiance(points.reshape(-1, 3), surface.normal, lamps, occluders).reshape(rows, columns)

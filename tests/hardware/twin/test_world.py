@@ -1,5 +1,6 @@
 """Pictures of the room against geometry: pixels where the pinhole puts them, depths where planes are."""
 
+import contextlib
 import math
 
 import cv2
@@ -8,10 +9,12 @@ import pytest
 
 from advnerf_core.geometry import Pinhole, invert_transform, look_at, planar_pose, transform_points
 from hardware.worlds.lab import gl, lighting
-from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.config import CameraConfig, LabConfig
 from hardware.worlds.lab.furniture import Solid, furnish, obstacles
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import track_length, track_pose
+from hardware.worlds.lab.renderer import Renderer
+from hardware.worlds.lab.surfaces import paint_room
 
 CONFIG = LabConfig()
 POSES = [(0.4, -2.0, 0.0), (1.2, -1.8, 0.15), (0.8, -2.3, 0.2)]
@@ -203,6 +206,22 @@ def test_furniture_stays_in_the_room():
         assert all(max(abs(x), abs(y)) < 4.0 + 1e-6 for x, y in solid.footprint.corners()), solid
         assert solid.centre_m[2] - solid.half_m[2] >= -1e-9
         assert solid.centre_m[2] + solid.half_m[2] <= CONFIG.room.height_m
+
+
+def test_a_room_is_painted_once_whatever_its_cameras_are():
+    painted = paint_room(LabConfig())
+    assert paint_room(LabConfig(camera=CameraConfig(width=168, height=94))) is painted
+    other = paint_room(LabConfig(shadows=False))[0]["floor"].image
+    assert other.mean() > painted[0]["floor"].image.mean()
+    moved = paint_room(LabConfig.model_validate({"board": {"x_m": 2.0}}))[0]["floor"].image
+    assert not np.array_equal(moved, painted[0]["floor"].image)  # the stand's shadow moves too
+
+
+def test_a_renderer_keeps_no_map_of_shadows_that_it_does_not_draw():
+    model = gl.load_mujoco().MjSpec().compile()
+    assert model.vis.quality.shadowsize > 0
+    with contextlib.closing(Renderer(model, 1)):
+        assert model.vis.quality.shadowsize == 0
 
 
 def test_light_without_occluders_is_the_lambert_sum():
