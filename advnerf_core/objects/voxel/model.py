@@ -70,12 +70,16 @@ class ObjectModel:
         return slots
 
     def placed(self, T_world_from_object: ArrayLike, scale: float = 1.0) -> VoxelGridObject:
-        """The object at a pose ``[4, 4]``, with ``scale`` world metres per metre of the object."""
+        """The object at a pose ``[4, 4]``, with ``scale`` world metres per metre of the object; what renderers derive is shared."""
         pose = np.asarray(T_world_from_object, dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ObjectFileError(
                 f"expected a finite pose [4, 4] for {self.name}, got shape {list(pose.shape)}"
             )
+        return self._in_its_own_frame.moved(pose, scale)
+
+    @cached_property
+    def _in_its_own_frame(self) -> VoxelGridObject:
         count = int(self.slots.max())
         return VoxelGridObject(
             slots=self.slots,
@@ -83,8 +87,7 @@ class ObjectModel:
             fixed_colours=np.array([_HIDDEN_RGB]),
             box_min=self.grids.box_min,
             box_max=self.grids.box_max,
-            T_world_from_object=pose,
-            scale=scale,
+            T_world_from_object=np.eye(4),
             density=np.asarray(self.grids.density, dtype=np.float64),
             step_units=self.grids.voxel / _STEPS_PER_VOXEL,
             plain_colours=np.asarray(self.grids.colours[self.slots < count], dtype=np.float64),

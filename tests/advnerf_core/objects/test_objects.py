@@ -27,7 +27,7 @@ from advnerf_core.objects.voxel.model import ObjectFileError, ObjectModel, load_
 from advnerf_core.objects.voxel.pictures import FitError, PosedRgba, RayBatches
 from advnerf_core.objects.voxel.views import viewing_lens
 from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, voxelise
-from advnerf_core.render.cast_object import cast_object
+from advnerf_core.render.cast_object import cast_object, prepared
 
 
 def ball(radius=0.5, hole=False):
@@ -68,6 +68,15 @@ def test_the_silhouette_of_a_ball_has_its_size(resolution):
     radius_px = lens.fx * np.tan(np.arcsin(0.5 / 6.0))
     voxel_px = lens.fx * model.grids.voxel / 6.0
     assert np.sqrt(picture[..., 3].sum() / np.pi) == pytest.approx(radius_px, abs=0.1 * voxel_px)
+
+
+def test_what_a_renderer_derives_from_a_model_is_shared_by_all_its_places(model):
+    pose = np.eye(4)
+    pose[:3, 3] = 1.0, 2.0, 0.5
+    one, other = model.placed(np.eye(4)), model.placed(pose, 2.0)
+    assert prepared(one, np.float64) is prepared(other, np.float64)
+    np.testing.assert_array_equal(other.T_world_from_object, pose)
+    assert (one.scale, other.scale) == (1.0, 2.0)
 
 
 def test_colours_reach_beyond_the_surface():
