@@ -157,6 +157,11 @@ def _redrive(folder: Path, count: int, seed: int) -> int:
     if not is_kept(folder):
         raise RedriveError(f"{folder.name} {LOST}")
     file = registered_file(registration.file)
+    if not file.is_file():
+        raise RedriveError(
+            f"{folder.name}: expected the experiment file {file.name} that was registered in launch/ or in this folder, found none; change to the folder "
+            "that it was registered in"
+        )
     with TemporaryDirectory() as run:
         changes = [*registration.overrides, *kept_victims(folder, Path(run) / "victims")]
         choice = CellChoice(file, registration.setting, Path(run) / "run", overrides=changes)

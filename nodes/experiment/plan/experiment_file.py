@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -98,9 +99,29 @@ def _layers(file: Path, above: Sequence[Path]) -> list[Document]:
         raise ConfigError(
             f"{document.place(('base',))}: expected a base other than the file itself, got {base}"
         )
-    if setting is None:
-        return [*_layers(at, (*above, file)), document]
-    return [_with_setting(at, str(setting), (*above, file)).document, document]
+    below = (
+        _layers(at, (*above, file))
+        if setting is None
+        else [_with_setting(at, str(setting), (*above, file)).document]
+    )
+    for layer in below:
+        layer.data = _seen_from(file.parent, at.parent, layer.data)
+    return [*below, document]
+
+
+def _seen_from(folder: Path, other: Path, value: Any) -> Any:
+    """A value of a file in ``other`` for a file in ``folder``: names of files there, also of ``FILE.py:NAME``, become paths to them from here."""
+    if folder.resolve() == other.resolve():
+        return value
+    if isinstance(value, dict):
+        return {key: _seen_from(folder, other, each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_seen_from(folder, other, each) for each in value]
+    if not isinstance(value, str) or not Path(value.partition(":")[0]).suffix:
+        return value
+    name, colon, rest = value.partition(":")
+    there = other / name
+    return os.path.relpath(there, folder) + colon + rest if there.is_file() else value
 
 
 def _variant(
@@ -113,7 +134,9 @@ def _variant(
         made = Document(copy.deepcopy(read.document.data), read.document.source, dict(read.document.places))
         made.data["name"] = read.of
     else:
-        made = _with_setting(file.parent / str(base), setting, (file,)).document
+        at = file.parent / str(base)
+        made = _with_setting(at, setting, (file,)).document
+        made.data = _seen_from(file.parent, at.parent, made.data)
     whole = read.document.data.get(OVER)
     made.data[OVER] = copy.deepcopy(coordinates_in(made.data.get(OVER)) | coordinates_in(whole))
     for key in _OF_THE_WHOLE[1:]:

@@ -69,6 +69,36 @@ def test_what_a_file_says_goes_before_every_setting_of_its_base(tmp_path):
     assert read_experiment_file(third, None, []).of == "mine"
 
 
+def test_files_that_a_base_names_lie_beside_the_base(tmp_path):
+    """A user's file in another folder than its base looked for them beside itself, and took others of the same name there."""
+    there = tmp_path / "launch"
+    there.mkdir()
+    for name in ("mine.py", "room.reference.yaml", "policy.onnx", "level"):
+        (there / name).touch()
+    (tmp_path / "policy.onnx").touch()
+    (there / "base.experiment.yaml").write_text(
+        "name: base\nreference: room.reference.yaml\nworld: {kind: level}\nvictims: {a: {policy: policy.onnx}, b: {policy: 'made:of'}}\n"
+        "settings:\n  demo: {over: {method: [gradient, 'mine.py:Method', absent.py:Method]}}\n"
+    )
+    (there / "above.experiment.yaml").write_text("base: base.experiment.yaml\nname: above\n")
+    mine = tmp_path / "mine.experiment.yaml"
+    for base in ("launch/base", "launch/above"):
+        mine.write_text(
+            f"base: {base}.experiment.yaml\nname: mine\nvictims: {{c: {{policy: policy.onnx}}}}\n"
+        )
+        assert read_experiment_file(mine, None, []).document.data == {
+            "name": "mine",
+            "reference": "launch/room.reference.yaml",
+            "world": {"kind": "level"},  # a name, although a file is called so
+            "victims": {
+                "a": {"policy": "launch/policy.onnx"},
+                "b": {"policy": "made:of"},
+                "c": {"policy": "policy.onnx"},
+            },
+            "over": {"method": ["gradient", "launch/mine.py:Method", "absent.py:Method"]},
+        }
+
+
 def test_an_experiment_is_the_product_of_what_it_goes_over(file):
     loaded = load(file)
     names = [cell.name for cell in loaded.cells]
