@@ -59,6 +59,6 @@ def test_rows_of_published_sets_are_computed_again():
 @pytest.mark.slow
 def test_all_rows_of_kept_data_and_verdicts_of_the_gate_are_computed_again():
     rows = read_rows()
-    assert sum(kept_by(row["command"]) is not None for row in rows) >= 171
+    assert sum(kept_by(row["command"]) is not None for row in rows) >= 108
     assert list(row_problems(rows, computed_again([row["command"] for row in rows]))) == []
     assert list(gate_problems()) == []
