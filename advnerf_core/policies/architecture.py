@@ -183,6 +183,10 @@ class Architecture:
 
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             network = self.build(2, 0.3).eval()
+            if not any(each.requires_grad for each in network.parameters()):
+                raise ArchitectureError(
+                    f"{_WHAT} {self.name}: expected weights to train, got none; make layers in __init__, and assign them to self"
+                )
             try:
                 network(torch.rand(2, 3, IMAGE_HEIGHT, IMAGE_WIDTH), torch.eye(2))
             except FAILURES as error:
@@ -190,6 +194,20 @@ class Architecture:
                     f"{_WHAT} {self.name}: a call with images [2, 3, {IMAGE_HEIGHT}, {IMAGE_WIDTH}] and goals [2, 2] failed: "
                     f"{type(error).__name__}: {error}"
                 ) from error
+            self._require_steady(network)
+
+    def _require_steady(self, network: SteeringNetwork) -> None:
+        from advnerf_core.geometry import Pinhole
+        from advnerf_core.policies.adapter import adapted
+        from advnerf_core.policies.conformance import require_steady
+        from advnerf_core.policies.contract import PolicyContract
+        from advnerf_core.policies.view import PolicyView
+
+        camera = Pinhole(
+            IMAGE_WIDTH, IMAGE_HEIGHT, IMAGE_WIDTH, IMAGE_WIDTH, IMAGE_WIDTH / 2, IMAGE_HEIGHT / 2
+        )
+        view = PolicyView(camera, crop_top_px=0, crop_height_px=IMAGE_HEIGHT)
+        require_steady(adapted(network, PolicyContract(view, goal_size=2)), f"{_WHAT} {self.name}")
 
     def described(self) -> dict[str, Any]:
         """Plain data that identifies the architecture on every machine; for a user's, the hash of its code and not the path of its file.

@@ -17,7 +17,7 @@ from advnerf_core.plugins import PluginError
 from advnerf_core.policies.adapter import AdaptedPolicy
 from advnerf_core.policies.architecture import ARCHITECTURES, Architecture, ArchitectureError
 from advnerf_core.policies.conformance import FAILURE, check_policy
-from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.load import described_policy, load_adapted
 from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.policies.policy_file import (
@@ -280,15 +280,45 @@ def test_what_cannot_be_built_is_one_clear_error(name, configuration, message) -
         Architecture(name, configuration).build(2, 0.3)
 
 
-def test_a_check_finds_an_output_of_another_shape(tmp_path) -> None:
-    (tmp_path / "column.py").write_text(
+@pytest.mark.parametrize(
+    ("layers", "output", "message"),
+    [
+        ("nn.Linear(3, 1)", "self.head(images[:, :, 0, 0])", r"expected an output \[B\], got \[2, 1\]"),
+        ("1.0", "images[:, 0, 0, 0]", "expected weights to train, got none; make layers in __init__"),
+        (
+            "nn.Linear(3, 1)",
+            "self.head(nn.functional.dropout(images[:, :, 0, 0], 0.5))[:, 0]",
+            "answers a picture always the same: the output is random: dropout or noise is left on",
+        ),
+        (
+            "nn.Linear(3, 1)",
+            "self.head(images[:, :, 0, 0] + self.asked())[:, 0]",
+            "answers a picture always the same: declared stateless, but the output depends on the images before",
+        ),
+        (
+            "nn.Linear(3, 1)",
+            "self.head(images[:, :, 0, 0] - images[:, :, 0, 0].mean(0))[:, 0]",
+            "answers a picture always the same: an image steers differently in a batch than alone",
+        ),
+    ],
+)
+def test_a_check_finds_a_network_that_would_be_trained_for_nothing(tmp_path, layers, output, message) -> None:
+    """Noise and memories were trained and saved without a word, and told as the effect of an attack."""
+    (tmp_path / "own.py").write_text(
+        "from torch import nn\n"
         "from advnerf_core.policies.network import SteeringNetwork\n"
-        "class Column(SteeringNetwork):\n"
+        "class Own(SteeringNetwork):\n"
+        "    def __init__(self, goal_size, max_steering_rad, configuration):\n"
+        "        super().__init__(goal_size, max_steering_rad, configuration)\n"
+        f"        self.head, self.count = {layers}, 0\n"
+        "    def asked(self):\n"
+        "        self.count += 1\n"
+        "        return self.count\n"
         "    def output(self, images, goals):\n"
-        "        return images[:, :1, 0, 0]\n"
+        f"        return {output}\n"
     )
-    with pytest.raises(ArchitectureError, match=r"expected an output \[B\], got \[2, 1\]"):
-        Architecture(f"{tmp_path}/column.py:Column").check()
+    with pytest.raises((ArchitectureError, PolicyContractError), match=message):
+        Architecture(f"{tmp_path}/own.py:Own").check()
 
 
 def test_only_a_known_architecture_is_written(tmp_path) -> None:
