@@ -43,13 +43,13 @@ def _rays(width, height, focal, cx, cy, distortion, supersampling):
     grid = flat.reshape(len(rows), len(columns), 2)
     down, right = ((np.arange(n * supersampling) + 0.5) / supersampling for n in (height, width))
     x, y = (RectBivariateSpline(rows, columns, grid[..., k])(down, right) for k in range(2))
-    directions = np.stack([x, y, np.ones_like(x)], axis=-1)
-    directions.setflags(write=False)
-    return directions
+    for directions in (x, y):
+        directions.setflags(write=False)
+    return x, y
 
 
 def rays(lens, supersampling):
-    """Directions ``[H s, W s, 3]`` with unit depth through the lens."""
+    """Directions through the lens with unit depth: x and y, each ``[H s, W s]``."""
     return _rays(lens.width, lens.height, lens.fx, lens.cx, lens.cy, lens.distortion, supersampling)
 
 
@@ -69,11 +69,11 @@ def photograph(
         response: Seen colours of linear light; sRGB if None.
     """
     directions = rays(lens, supersampling)
-    found = np.full(directions.shape, wall)
+    found = np.full((*directions[0].shape, 3), wall)
     for sheet, T in reversed(sheets):
-        found = _over(found, directions, sheet, T, bend_m, dpi, black)
+        _draw_over(found, directions, sheet, T, bend_m, dpi, black)
     across = np.linspace(-0.5, 0.5, found.shape[1])[None, :, None]
-    found = found * np.array(light) * (1.0 + slope * across)
+    found *= np.array(light) * (1.0 + slope * across)
     if covered is not None:
         found[:, : round(covered * found.shape[1])] = 0.12
     size = (lens.width, lens.height)
@@ -93,17 +93,22 @@ def decoded(seen):
     return np.where(seen <= 0.04045, seen / 12.92, ((seen + 0.055) / 1.055) ** 2.4)
 
 
-def _over(behind, directions, sheet, T, bend_m, dpi, black):
+def _draw_over(behind, directions, sheet, T, bend_m, dpi, black):
     picture, (width_m, height_m) = _picture(sheet, dpi)
+    part = _where(directions, T, width_m, height_m, bend_m)
+    right, down = (each[part] for each in directions)
+    if not right.size:
+        return
     T_face_from_camera = invert_transform(T)
-    origin, slopes = T_face_from_camera[:3, 3], directions @ T_face_from_camera[:3, :3].T
-    depth = np.zeros(directions.shape[:2])
+    origin = T_face_from_camera[:3, 3]
+    slopes = [right * a + down * b + c for a, b, c in T_face_from_camera[:3, :3]]
+    depth = np.zeros(right.shape)
     for _ in range(12 if bend_m else 1):  # fixed point of the bent sheet: x = bend (1 - (2 y / width)^2)
-        y = origin[1] + depth * slopes[..., 1]
-        x = bend_m * (1.0 - np.clip(2.0 * y / width_m, -1.0, 1.0) ** 2)
+        y = origin[1] + depth * slopes[1]
+        x = _bent(y, width_m, bend_m)
         with np.errstate(divide="ignore"):
-            depth = (x - origin[0]) / slopes[..., 0]
-    y, z = (origin[k] + depth * slopes[..., k] for k in (1, 2))
+            depth = (x - origin[0]) / slopes[0]
+    y, z = (origin[k] + depth * slopes[k] for k in (1, 2))
     columns = (y / width_m + 0.5) * picture.shape[1] - 0.5
     rows = (0.5 - z / height_m) * picture.shape[0] - 0.5
     inside = (np.abs(y) < 0.5 * width_m) & (np.abs(z) < 0.5 * height_m) & (depth > 0.0)
@@ -114,7 +119,29 @@ def _over(behind, directions, sheet, T, bend_m, dpi, black):
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    return np.where(inside[..., None], black + (1.0 - black) * seen, behind)
+    np.copyto(behind[part], black + (1.0 - black) * seen, where=inside[..., None])
+
+
+def _bent(y_m, width_m, bend_m):
+    return bend_m * (1.0 - np.clip(2.0 * y_m / width_m, -1.0, 1.0) ** 2)
+
+
+def _where(directions, T, width_m, height_m, bend_m):
+    """Slices of rows and columns that surely contain a sheet: in the rest of a photograph nothing has to be computed."""
+    y, z = np.meshgrid(np.linspace(-0.5, 0.5, 33) * width_m, np.linspace(-0.5, 0.5, 33) * height_m)
+    places = np.stack([_bent(y, width_m, bend_m), y, z], axis=-1) @ T[:3, :3].T + T[:3, 3]
+    if places[..., 2].min() <= 0.0:
+        return slice(None), slice(None)
+    ends = []
+    # Directions grow along a row and a column, as far as they may bend.
+    for axis, along in enumerate(directions):
+        seen = places[..., axis] / places[..., 2]
+        room = 0.02 * np.ptp(seen)
+        lines = ((along > seen.min() - room) & (along < seen.max() + room)).any(axis=axis)
+        found = np.flatnonzero(lines)
+        ends.append(slice(found[0], found[-1] + 1) if len(found) else slice(0, 0))
+    columns, rows = ends
+    return rows, columns
 
 
 def _picture(sheet, dpi):
