@@ -8,7 +8,8 @@ from advnerf_core.strict import LagS, LengthM
 
 _LARGEST = 2**31 - 1  # what kernels and generators of random numbers count with
 Count = Annotated[int, Field(ge=0, le=_LARGEST)]
-Positive = Annotated[int, Field(ge=1, le=_LARGEST)]
+# No computer drives, photographs or trains so often in a month: a zero too many, or milliseconds for ticks.
+Positive = Annotated[int, Field(ge=1, le=1_000_000)]
 PositiveNumber = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]

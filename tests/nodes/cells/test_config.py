@@ -198,6 +198,8 @@ def test_a_claim_is_about_cells_that_are_there(file, change, told):
             r"over.victim: expected a victim in room of hardened; got 'naive'",
         ),
         ("measure.seed=-1", "measure.seed: .* greater than or equal to 0, got -1"),
+        ("horizon=1e9", "horizon: .* less than or equal to 1000000, got 1000000000"),
+        ("attack.evaluations=2000000", "attack.evaluations: .* less than or equal to 1000000, got 2000000$"),
         (f"measure.seed={10**30}", "measure.seed: .* less than or equal to 2147483647, got 10{30}$"),
         *(
             (
