@@ -8,13 +8,11 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.main import get_command
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.places import use_writable_cache
@@ -238,14 +236,9 @@ def _is_signal(code: object) -> bool:
     return is_signal(code)
 
 
-@cache  # who calls `main` again, as tests do, need not wait again for all commands to be declared
-def _command() -> Any:
-    return get_command(app)
-
-
 def _exit_code() -> int:
     try:
-        ended = _command()(standalone_mode=False)
+        ended = app(standalone_mode=False)
     except KeyboardInterrupt:
         return INTERRUPTED
     except SystemExit as asked:

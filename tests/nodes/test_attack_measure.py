@@ -1,7 +1,6 @@
 """`advnerf attack measure`: an attack is printed, photographed, measured, and driven past as it hangs."""
 
 import json
-import sys
 from dataclasses import replace
 
 import cv2
@@ -31,7 +30,6 @@ from calibration.print_model import LaidPrint
 from calibration.print_pose import PrintPose, fit_print
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
 from nodes.bags.writer import BagWriter
-from nodes.cli import main as cli
 from nodes.experiment.node.printed import record_beside
 from nodes.experiment.node.search import run_attack
 from nodes.experiment.show.own_scene import own_objects
@@ -39,6 +37,7 @@ from nodes.lab.wizards.prints import MeasuredPrint, write_measured
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import encode, image_message, pose_message
 from nodes.runtime.progress import ProgressDisplay
+from tests.support.commands import advnerf
 from tests.support.faces import face_attack
 from tests.support.photographed import before_camera, lens, photograph, scaled
 from tests.support.tiny_request import CALIBRATION, loaded, tiny_request, with_objects
@@ -56,12 +55,9 @@ START_NS = 1_800_000_000_000_000_000
 def call(monkeypatch, capsys):
     """Call the command: exit code, and what it says in one line."""
 
-    def call(*arguments: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["advnerf", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), " ".join((said.out + said.err).split())
+    def call(*arguments: object) -> tuple[object, str]:
+        code, said = advnerf(monkeypatch, *arguments), capsys.readouterr()
+        return code, " ".join((said.out + said.err).split())
 
     return call
 

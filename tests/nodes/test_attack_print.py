@@ -1,6 +1,5 @@
 """`advnerf attack print` as people call it."""
 
-import sys
 from pathlib import Path
 
 import cv2
@@ -11,8 +10,8 @@ from advnerf_core.attack.artifact import load_attack, save_attack
 from advnerf_core.attack.printing.record import load_record
 from advnerf_core.fields.voxel_grid import face_corners_in_object
 from advnerf_core.geometry import Pinhole
-from nodes.cli import main as cli
 from nodes.experiment.node.printed import stem_of
+from tests.support.commands import advnerf
 from tests.support.faces import face_attack
 
 
@@ -42,12 +41,9 @@ def file(tmp_path: Path) -> Path:
 def printed(monkeypatch, capsys, file):
     """Call the command: exit code, and what it says in one line."""
 
-    def call(*arguments: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["advnerf", "attack", "print", str(file), *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), " ".join((said.out + said.err).split())
+    def call(*arguments: object) -> tuple[object, str]:
+        code, said = advnerf(monkeypatch, "attack", "print", file, *arguments), capsys.readouterr()
+        return code, " ".join((said.out + said.err).split())
 
     return call
 
@@ -124,12 +120,7 @@ def test_the_record_of_another_print_is_never_replaced(printed, file):
 
 def test_nor_that_of_another_chart(monkeypatch, tmp_path, capsys):
     def chart(*arguments):
-        monkeypatch.setattr(
-            sys, "argv", ["advnerf", "car", "calibrate", "printer-chart", *map(str, arguments)]
-        )
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        return ended.value.code
+        return advnerf(monkeypatch, "car", "calibrate", "printer-chart", *arguments)
 
     assert chart("-o", tmp_path / "chart.png", "--dpi", 50) == 0
     before = (tmp_path / "chart.print.json").read_text()

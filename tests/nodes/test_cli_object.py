@@ -1,7 +1,6 @@
 """The commands `advnerf scene object ...` as a user types them."""
 
 import json
-import sys
 
 import cv2
 import numpy as np
@@ -11,17 +10,13 @@ import trimesh
 from advnerf_core.objects.voxel.build import mesh_views
 from advnerf_core.objects.voxel.generators import hydrant
 from advnerf_core.objects.voxel.model import load_object
-from nodes.cli import main as cli
+from tests.support.commands import advnerf
 
 
 @pytest.fixture
 def command(monkeypatch, capsys):
     def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["advnerf", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        captured = capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
+        return advnerf(monkeypatch, *arguments), *capsys.readouterr()
 
     return call
 

@@ -15,8 +15,8 @@ from advnerf_core.geometry import Pinhole
 from advnerf_core.objects.voxel.build import mesh_views
 from advnerf_core.objects.voxel.generators import hydrant, small_car
 from advnerf_core.scene.render_field import FieldRenderer
-from nodes.cli import main as cli
 from nodes.lab.scene_view import SceneView
+from tests.support.commands import advnerf
 from tests.support.waiting import wait_for
 
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -41,11 +41,7 @@ def pictures(tmp_path_factory):
 @pytest.fixture
 def command(monkeypatch, capsys):
     def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["advnerf", "scene", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        captured = capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
+        return advnerf(monkeypatch, "scene", *arguments), *capsys.readouterr()
 
     return call
 

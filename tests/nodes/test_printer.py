@@ -1,7 +1,6 @@
 """A printer and a light from one photograph of a chart: against a printer whose inks are known, and on a print in the simulated lab."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -20,10 +19,10 @@ from calibration.print_chart import chart_record, fit_printer, make_chart, print
 from calibration.schema import load_calibration, save_calibration
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.world import Panel
-from nodes.cli import main as cli
 from nodes.experiment.node.prepare import prepare
 from nodes.experiment.node.search import run_attack
 from nodes.runtime.progress import ProgressDisplay
+from tests.support.commands import advnerf
 from tests.support.photographed import before_camera, encoded, lens, photograph
 from tests.support.printers import printed, printer_model
 from tests.support.tiny_request import loaded, tiny_request
@@ -44,12 +43,9 @@ def on_paper(sheet, dpi):
 
 @pytest.fixture
 def call(monkeypatch, capsys):
-    def call(*arguments: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["advnerf", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), " ".join((said.out + said.err).split())
+    def call(*arguments: object) -> tuple[object, str]:
+        code, said = advnerf(monkeypatch, *arguments), capsys.readouterr()
+        return code, " ".join((said.out + said.err).split())
 
     return call
 
