@@ -236,26 +236,27 @@ def test_a_search_of_an_object_out_of_sight_is_no_result(tmp_path, changes):
     assert not attack_file(tmp_path / "run", 0).exists()
 
 
-def test_a_policy_that_ignores_what_it_sees_is_a_result(tmp_path):
-    file = tiny_request(tmp_path, evaluations=2)
-    policy = load_policy(tmp_path / "policy.safetensors")
+def blind(file):
+    """Give a policy weights of zero: it ignores what it sees."""
+    policy = load_policy(file)
     with torch.no_grad():
         for weights in policy.policy.parameters():
             weights.zero_()
-    save_policy(tmp_path / "policy.safetensors", policy.policy, policy.view, {})
+    save_policy(file, policy.policy, policy.view, {})
+
+
+def test_a_policy_that_ignores_what_it_sees_is_a_result(tmp_path):
+    file = tiny_request(tmp_path, evaluations=2)
+    blind(tmp_path / "policy.safetensors")
     (found,) = run_attack(loaded(file, ["over.method=[random]"]), tmp_path / "run", ProgressDisplay())
     assert len(set(json.loads(found.with_name("seed_0.json").read_text())["predicted_total_cte_m"])) == 1
 
 
 @pytest.mark.parametrize("method", ["gradient", "frame"])
 def test_a_gradient_that_is_zero_finds_nothing_and_ends_the_search_at_once(tmp_path, method):
-    """The policy clips what it would steer: its starting noise was told as the attack of a gradient, and looked like a robust policy."""
+    """The search's starting noise was told as the attack that a gradient found, and the policy looked robust."""
     file = tiny_request(tmp_path, evaluations=50)
-    policy = load_policy(tmp_path / "policy.safetensors")
-    with torch.no_grad():
-        for weights in policy.policy.parameters():
-            weights.zero_()
-    save_policy(tmp_path / "policy.safetensors", policy.policy, policy.view, {})
+    blind(tmp_path / "policy.safetensors")
     with pytest.raises(ZeroGradientError, match=r"exactly zero for all \d+ parameters at the first drive"):
         run_attack(loaded(file, [f"over.method=[{method}]"]), tmp_path / "run", ProgressDisplay())
     assert not attack_file(tmp_path / "run", 0).exists()
