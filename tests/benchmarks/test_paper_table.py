@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import cache, lru_cache
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ import pytest
 from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.page import searched_apart
 from benchmarks.paper_table import PUBLISHED, ledger_rows
+
+cells_of, published_rows = lru_cache(maxsize=1)(read_cells), cache(ledger_rows)
 
 CAR, CAR_SIDES, CAR_LONG, MONITOR, WALL, JUNCTION, SIDES, SPACES = (
     PUBLISHED / f"paper_{name}"
@@ -39,15 +42,13 @@ CAR, CAR_SIDES, CAR_LONG, MONITOR, WALL, JUNCTION, SIDES, SPACES = (
 def test_drives_off_the_track_are_those_of_the_cells(published, scenario, changed, met):
     cells = [
         each
-        for each in read_cells(published)
+        for each in cells_of(published)
         if (each.scenario, each.victim, each.method) == (scenario, "hardened", "gradient")
     ]
     off = [left for cell in cells for left in cell.deployed.off_track]
     hit = [obstacle for cell in cells for obstacle in cell.obstacles("deployed") if obstacle]
     row, unharmed = (
-        each
-        for each in ledger_rows(PUBLISHED)
-        if scenario.replace("_", " ") + f"{changed}, victim" in each.line
+        each for each in published_rows() if scenario.replace("_", " ") + f"{changed}, victim" in each.line
     )
     assert row.value == round(100.0 * sum(off) / len(off))
     assert row.met is met
@@ -66,7 +67,7 @@ def test_drives_off_the_track_are_those_of_the_cells(published, scenario, change
 
 
 def test_the_tests_are_those_of_complete_sets(tmp_path):
-    row = ledger_rows(PUBLISHED)[0]
+    row = published_rows()[0]
     tests = [
         each
         for name in (CAR, CAR_SIDES, CAR_LONG, MONITOR, WALL, JUNCTION, SIDES, SPACES)
@@ -107,7 +108,7 @@ def test_the_excess_at_the_junction_is_over_the_stronger_control_of_its_cells(pu
         """Mean |CTE| per tick of each start, over the searches [m]."""
         found = [
             np.divide(each.deployed.total_cte_m, each.ticks)
-            for each in read_cells(published)
+            for each in cells_of(published)
             if (each.scenario, each.victim, each.method) == (scenario, "hardened", method)
         ]
         return np.mean(found, axis=0)
@@ -115,9 +116,7 @@ def test_the_excess_at_the_junction_is_over_the_stronger_control_of_its_cells(pu
     controls = {"plain": mean_m("none"), "no": mean_m("empty")}
     stronger = max(controls, key=lambda each: controls[each].mean())
     changed = ", one side of the path maximised" if published is SIDES else ""
-    row = next(
-        each for each in ledger_rows(PUBLISHED) if f"junction, {scenario}{changed}, victim" in each.line
-    )
+    row = next(each for each in published_rows() if f"junction, {scenario}{changed}, victim" in each.line)
     expected_m = (mean_m("gradient") - controls[stronger]).mean()
     assert row.note.startswith(f"{expected_m:.3f} m in the mean over {stronger} objects, 6 searches")
     assert row.value < expected_m

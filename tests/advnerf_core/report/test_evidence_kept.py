@@ -47,3 +47,18 @@ def test_what_is_no_drive_is_refused(changed):
         KeptDrive.model_validate({**KeptDrive.of(drive(), 20).model_dump(), **changed})
     with pytest.raises(ValueError, match="of one length"):
         KeptDrive(x_m="1 2", y_m="1", yaw_rad="1 2", driven_ticks=1).poses()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "0", "-1.25 3", "12345678901 1", "1e-05 2", "1  2", "\t1 2\n", "-0.00000 1."]
+)
+def test_numbers_are_taken_as_they_are(text):
+    kept = KeptDrive(x_m=text, y_m=text, yaw_rad=text, driven_ticks=0)
+    assert kept.x_m == text
+    np.testing.assert_array_equal(kept.poses()[:, 0], [float(each) for each in text.split()])
+
+
+@pytest.mark.parametrize("text", ["nan", "1 inf", "1e400", "1-2", "1,2", "1 -", "1.2.3", "one"])
+def test_what_is_no_finite_number_is_refused(text):
+    with pytest.raises(ValueError, match="x_m"):
+        KeptDrive(x_m=text, y_m="1", yaw_rad="1", driven_ticks=0)
