@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
 
 from advnerf_core.driving.path import Arc, Line, Path
 from advnerf_core.geometry import Array, wrap_angle
@@ -102,7 +103,20 @@ def fit_path(trace: ArrayLike, closed: bool | None = None) -> PathFit:
             f"lines and arcs leave {1000 * fit.rms_m:.0f} mm rms of this trace (limit {1000 * _WORST_RMS_M:.0f} mm): drive "
             "or draw it smoothly along the tape, at walking pace, in one direction"
         )
+    _require_along_trace(fit)
     return fit
+
+
+def _require_along_trace(fit: PathFit) -> None:
+    """Refuse a path with a part where nobody was: each of the trace's points is on it all the same."""
+    xy = fit.path.pose_at(np.arange(0.0, fit.path.length_m, _STEP_M))[:, :2]
+    away_m = cKDTree(fit.trace[:, :2]).query(xy)[0]
+    worst = int(away_m.argmax())
+    if away_m[worst] > _MOST_JUMP_M:
+        raise DegenerateDataError(
+            f"expected a path along the trace, got one whose point {xy[worst, 0]:.2f}, {xy[worst, 1]:.2f} m is {away_m[worst]:.2f} m from the nearest "
+            "place of the trace: was the way driven there and back? Drive it in one direction"
+        )
 
 
 def _thinned(xy: Array) -> Array:

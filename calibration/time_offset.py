@@ -45,6 +45,8 @@ _LEAST_CORRELATION = 0.9
 _MOST_SECOND_PEAK = 0.97
 # A larger standard deviation of the result is refused [s].
 _MOST_STDDEV_S = 0.003
+# A camera ahead of the rear axle by a third of the wall's distance sees half as much turning again. Another lens, or degrees, are farther off.
+_LEAST_SCALE, _MOST_SCALE = 0.7, 1.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +181,11 @@ def fit_offset(turns: Turns, pose_s: Array, yaw_rad: Array) -> OffsetFit:
         raise DegenerateDataError(
             f"expected an offset known to {1000 * _MOST_STDDEV_S:.0f} ms, got {1000 * found.x[0]:.0f} ms give or take {1000 * stddev:.1f} ms: turn "
             "the car to and fro faster, and longer"
+        )
+    if not _LEAST_SCALE <= found.x[1] <= _MOST_SCALE:
+        raise PoorFitError(
+            f"expected pictures that turn about as far as the car ({_LEAST_SCALE:g} to {_MOST_SCALE:g} times), got {found.x[1]:.3g} times: is the lens in "
+            "camera.yaml this camera's, does motion capture send radians, and is the wall farther away than the camera from the rear axle?"
         )
     rms = float(np.sqrt(np.mean(left**2)))
     return OffsetFit(

@@ -198,7 +198,7 @@ class Path:
         if np.abs(gap).max() > CLOSURE_TOLERANCE:
             raise ValueError(
                 f"expected a closed path to end at its start {self.start_pose}, got an end at {self._poses[-1].tolist()};"
-                " change the segments or pass closed=False"
+                " change the segments, or say closed: false"
             )
 
     def _wrap(self, s_m: ArrayLike) -> tuple[Array, Array]:

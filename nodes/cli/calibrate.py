@@ -188,7 +188,7 @@ def camera_to_car(
     tracked = None if untracked else board_topic
     bag = _source(source, live, tuple(t for t in (IMAGES, CAR, tracked) if t), output)
     camera = load_lens(lens)
-    views, frames = still_views(bag, detector, tracked)
+    views, frames = still_views(bag, detector, tracked, (camera.width, camera.height))
     print(f"{len(views)} stops with the board in view among {frames} frames")
     fit = calibrate_mount(views, camera, None if pattern is None else _transform(pattern))
     new = with_kept(fit.calibration(camera), output)

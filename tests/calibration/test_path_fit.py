@@ -76,6 +76,14 @@ def test_a_car_that_was_carried_to_the_lap_and_away_is_measured_where_it_drove()
     assert driven_part(lap) == slice(0, 900)
 
 
+def test_a_way_there_and_back_gives_no_path_where_nobody_was():
+    """Each point of the trace is on such a path, and the half of it is beyond the trace's end."""
+    along = np.concatenate([np.arange(-2.0, 2.0, 0.008), np.arange(2.0, -2.0, -0.008)])
+    noise = np.random.default_rng(0).normal(0.0, 0.002, (len(along), 2))
+    with pytest.raises(DegenerateDataError, match=r"there and back\? Drive it in one direction"):
+        fit_path(np.stack([along, np.zeros_like(along)], axis=1) + noise)
+
+
 def test_standing_still_before_and_after_changes_nothing():
     rng = np.random.default_rng(1)
     trace = driven(SQUARE, 1.05)

@@ -49,6 +49,16 @@ def test_a_car_that_was_hidden_for_two_seconds_costs_only_those_turns(offset_s):
     assert 185 < len(fit.turns.yaw_rad) < 195
 
 
+@pytest.mark.parametrize(("of_camera", "of_car"), [(1.0, np.degrees(1.0)), (2.0, 1.0), (0.5, 1.0)])
+def test_a_lens_or_a_unit_that_is_not_theirs_is_refused(of_camera, of_car):
+    """Degrees, and a lens of another focal length, fitted as well as the truth does, with another scale."""
+    found = turns(0.04, np.random.default_rng(0), yaw=lambda t: of_camera * yaw_at(t))
+    with pytest.raises(PoorFitError, match=r"got [\d.]+ times: is the lens") as refused:
+        fit_offset(found, POSE_S, of_car * yaw_at(POSE_S))
+    got = float(str(refused.value).partition("got ")[2].partition(" times")[0])
+    assert got == pytest.approx(of_camera / of_car, rel=0.02)
+
+
 def test_pictures_of_a_far_wall_turn_as_the_camera_did():
     """A texture at infinity, warped by the known rotation: image turns against the closed form."""
     times = np.arange(0.0, 2.0, 0.1)

@@ -262,8 +262,9 @@ def test_intrinsics_from_a_folder_then_refused_with_half_of_it(tmp_path, capsys)
     )
 
 
-def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
-    """Stops with a tilted, tracked board; between them the car moves, and those frames must not count."""
+@pytest.mark.parametrize("on_the_way", [True, False])
+def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys, on_the_way):
+    """Stops with a tilted, tracked board; frames that are taken between them must not count, and there may be none."""
     rng = np.random.default_rng(2)
     board = Board(6, 5, 0.12, 0.09)
     picture = np.pad(board.picture(60), 60, constant_values=255)
@@ -303,7 +304,8 @@ def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
         for topic, which in (("/vicon/car", 0), ("/vicon/board", 1)):
             moved = [poses(t)[which] @ make_transform(np.eye(3), rng.normal(0.0, 0.0003, 3)) for t in times]
             write_poses(writer, topic, times, moved)
-        for k, t in enumerate(np.arange(0.2, times[-1], 0.2)):
+        at_stops = (move_s + stop_s) * np.arange(stops) + move_s + 0.5 * stop_s
+        for k, t in enumerate(np.arange(0.2, times[-1], 0.2) if on_the_way else at_stops):
             car, held = poses(t)
             T = np.linalg.inv(car @ mount) @ held @ pattern @ edge
             stamp = ns(t)
@@ -314,8 +316,12 @@ def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
                 stamp,
                 k,
             )
-    views, frames = still_views(tmp_path / "bag", BoardDetector(board), "/vicon/board")
-    assert frames > 50
+    with pytest.raises(
+        DegenerateDataError, match="frames of 480 x 360, as the lens was calibrated for, got 336 x 188"
+    ):
+        still_views(tmp_path / "bag", BoardDetector(board), "/vicon/board", (480, 360))
+    views, frames = still_views(tmp_path / "bag", BoardDetector(board), "/vicon/board", (336, 188))
+    assert frames > 50 if on_the_way else frames == stops
     assert 12 <= len(views) <= stops
     options = (
         "--columns",

@@ -19,6 +19,7 @@ from nodes.bags.one_clock import require_one_clock
 from nodes.bags.reader import read_attachment, read_info
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.lab.importing.errors import ImportRecordingError
+from nodes.lab.wizards.bags import require_metres_and_z_up
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import stamp_ns
 from nodes.runtime.pictures import rgb_image
@@ -78,7 +79,10 @@ def take_frames(
         ImportRecordingError: The calibration is missing, the image size differs from it, or the frames have no poses.
     """
     camera = _camera(bag, calibration)
-    poses = PoseBuffer.of_recording(read_poses(bag, CAR_TOPIC))
+    rows = list(read_poses(bag, CAR_TOPIC))
+    if rows:
+        require_metres_and_z_up(np.stack([T for _, T in rows]), bag, CAR_TOPIC)
+    poses = PoseBuffer.of_recording(rows)
     topic = image_topic(bag)
     require_one_clock(bag, (topic, CAR_TOPIC))
     stamps = [stamp_ns(message) for message in image_messages(bag, topic)]
@@ -93,6 +97,10 @@ def take_frames(
             "was the motion capture on, and were both clocks synchronised?"
         )
     chosen = choose_by_motion(np.stack([T for _, _, T in placed]), config)
+    if len(chosen) < 2:
+        raise ImportRecordingError(
+            f"expected frames of {bag} from several places, got {len(placed)} within {config.step_m:g} m of one: the car stood; drive it through the place"
+        )
     wanted = {placed[i][0]: placed[i] for i in chosen}
     files = _write_frames(bag, topic, folder, wanted, camera, report)
     return DrivenFrames(

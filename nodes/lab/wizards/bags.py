@@ -44,6 +44,8 @@ _STEEPEST, _LIFTED_M = 0.5, 0.5
 _MOST_MOTION_M = 0.004
 # Largest angle of a pose from their mean [rad].
 _MOST_TURN_RAD = 0.008
+# Poses of one stop differ less, those of two more.
+_ELSEWHERE_M, _ELSEWHERE_RAD = 0.02, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +87,16 @@ def read_poses(bag: Path, topic: str) -> PoseSeries:
         )
     stamps = sorted(rows)
     found = PoseSeries(np.array(stamps, np.int64), np.stack([rows[stamp] for stamp in stamps]))
-    _require_metres_and_z_up(found.T, bag, topic)
+    require_metres_and_z_up(found.T, bag, topic)
     return found
 
 
-def _require_metres_and_z_up(T: Array, bag: Path, topic: str) -> None:
+def require_metres_and_z_up(T: Array, bag: Path, topic: str) -> None:
+    """Refuse poses ``[N, 4, 4]`` of motion capture in another unit or with another axis up.
+
+    Raises:
+        DegenerateDataError: They are.
+    """
     span_m = float(np.linalg.norm(np.ptp(T[:, :3, 3], axis=0)))
     if span_m > _WIDEST_M:
         raise DegenerateDataError(
@@ -162,14 +169,20 @@ def read_drive(bag: Path) -> RecordedDrive:
     )
 
 
-def still_views(bag: Path, detector: BoardDetector, board_topic: str | None) -> tuple[list[MountView], int]:
+def still_views(
+    bag: Path, detector: BoardDetector, board_topic: str | None, size: tuple[int, int]
+) -> tuple[list[MountView], int]:
     """Find the middle frame with a board in view of each time that car and board stood still.
 
     Args:
         board_topic: Topic of the board's poses; None if it is not tracked.
+        size: Width and height of the frames that the lens was calibrated for [px].
 
     Returns:
         The views, and the number of frames in the bag.
+
+    Raises:
+        DegenerateDataError: The frames have another size.
     """
     car = read_poses(bag, CAR)
     board = None if board_topic is None else read_poses(bag, board_topic)
@@ -177,12 +190,31 @@ def still_views(bag: Path, detector: BoardDetector, board_topic: str | None) -> 
     count = 0
     for stamp, image in read_frames(bag):
         count += 1
+        if image.shape[1::-1] != size:
+            raise DegenerateDataError(
+                f"expected frames of {size[0]} x {size[1]}, as the lens was calibrated for, got {image.shape[1]} x {image.shape[0]} in {bag}; give the "
+                "lens of this camera and resolution with --lens"
+            )
         view = _still_view(stamp, image, car, board, detector)
         if view is not None:
+            if stops[-1] and _is_elsewhere(view, stops[-1][0]):  # no frame was taken on the way
+                stops.append([])
             stops[-1].append(view)
         elif stops[-1]:
             stops.append([])
     return [stop[round(0.5 * (len(stop) - 1))] for stop in stops if stop], count
+
+
+def _is_elsewhere(view: MountView, other: MountView) -> bool:
+    """Whether car or board have moved between two views."""
+    pairs = [(view.T_world_from_car, other.T_world_from_car)]
+    if view.T_world_from_board is not None and other.T_world_from_board is not None:
+        pairs.append((view.T_world_from_board, other.T_world_from_board))
+    return any(
+        float(np.linalg.norm(one[:3, 3] - two[:3, 3])) > _ELSEWHERE_M
+        or float(rotation_angles(two[:3, :3].T @ one[:3, :3])) > _ELSEWHERE_RAD
+        for one, two in pairs
+    )
 
 
 def read_shown(folder: Path) -> tuple[Array, Array, Array]:
