@@ -43,6 +43,8 @@ _LEAST_TURN_RAD = 0.015
 _LEAST_CORRELATION = 0.9
 # A second peak of more than this share of the first is ambiguous.
 _MOST_SECOND_PEAK = 0.97
+# Rhythms up to this period are looked for [s]: nobody turns a car by hand more slowly and alike.
+_LONGEST_RHYTHM_S = 2.5
 # A larger standard deviation of the result is refused [s].
 _MOST_STDDEV_S = 0.003
 # A camera ahead of the rear axle by a third of the wall's distance sees half as much turning again. Another lens, or degrees, are farther off.
@@ -161,6 +163,7 @@ def fit_offset(turns: Turns, pose_s: Array, yaw_rad: Array) -> OffsetFit:
     )
     _require_turning(turns)
     yaw = CubicSpline(pose_s, _smoothed(pose_s, yaw_rad))
+    _require_no_rhythm(yaw, turns, float(pose_s[0]))
     count = round(_LARGEST_S / _STEP_S)
     shifts: Array = _STEP_S * np.arange(-count, count + 1, dtype=np.float64)
     correlation = np.array(
@@ -281,6 +284,21 @@ def _require_turning(turns: Turns) -> None:
         raise DegenerateDataError(
             f"expected turns to and fro, got a steady rate ({rms:.4f} rad per frame, varying by {spread:.4f}): it looks the same at any offset"
         )
+
+
+def _require_no_rhythm(yaw: CubicSpline, turns: Turns, first_s: float) -> None:
+    """Refuse turning that repeats itself: an offset beyond the search by one period would be found within it."""
+    for period_s in np.arange(_LARGEST_S, _LONGEST_RHYTHM_S, 4.0 * _STEP_S):
+        inside = turns.start_s - period_s > first_s
+        if inside.sum() < _MIN_TURNS:
+            return
+        late = Turns(turns.start_s[inside], turns.end_s[inside], turns.yaw_rad[inside])
+        alike = _correlation(_car_turns(yaw, late, 0.0), _car_turns(yaw, late, float(period_s)))
+        if alike > _MOST_SECOND_PEAK:
+            raise DegenerateDataError(
+                f"expected irregular turning, got turns that repeat after about {period_s:.2f} s (correlation {alike:.3f}): offsets that differ by as much "
+                "look alike; turn the car irregularly, not in a rhythm"
+            )
 
 
 def _peak(shifts: Array, correlation: Array) -> float:

@@ -37,6 +37,8 @@ _LEAST_STEERING_STEP_RAD = 0.08
 _LEAST_SPEED_STEP_MPS = 0.15
 # A larger share of the motion's variance left by the model is refused.
 _MOST_UNEXPLAINED = 0.1
+# A gain or wheelbase that differs by more than this from the file of the drive is remarked; so are limits so much beyond the servo's reach [rad].
+_OTHER_SIZE, _REACH_RAD = 1.5, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,6 +204,28 @@ def vehicle_calibration(
             servo_max=g.servo_max,
         ),
     )
+
+
+def remarks(found: VehicleCalibration, before: VehicleCalibration) -> list[str]:
+    """What of a fit is far from the file that the drive was made with, or beyond what the servo reaches."""
+    g, lines = found.gains, []
+    values = {
+        "erpm_per_mps": (g.erpm_per_mps, before.gains.erpm_per_mps),
+        "servo_per_rad": (g.servo_per_rad, before.gains.servo_per_rad),
+        "wheelbase_m": (found.wheelbase_m, before.wheelbase_m),
+    }
+    for name, (now, old) in values.items():
+        if not 1.0 / _OTHER_SIZE <= now / old <= _OTHER_SIZE:
+            lines.append(
+                f"warning: {name} is {now:.4g}, {now / old:.2g} times that of --before ({old:.4g}): are poses in metres, and is --wheelbase right?"
+            )
+    low, high = sorted((end - g.servo_offset) / g.servo_per_rad for end in (g.servo_min, g.servo_max))
+    if found.limits.steering_min_rad < low - _REACH_RAD or found.limits.steering_max_rad > high + _REACH_RAD:
+        lines.append(
+            f"warning: the servo's range reaches {low:+.3f} to {high:+.3f} rad, and the limits that are kept are {found.limits.steering_min_rad:+.3f} to "
+            f"{found.limits.steering_max_rad:+.3f} rad: the learned scene would steer farther than the car; narrow them, or centre the servo"
+        )
+    return lines
 
 
 def _require_sign(name: str, found: float, before: float, first_guess: str) -> None:

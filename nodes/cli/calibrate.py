@@ -180,7 +180,7 @@ def camera_to_car(
     from calibration.camera_to_car import calibrate_mount
     from calibration.charuco import BoardDetector
     from calibration.plots import mount_plot
-    from nodes.lab.wizards.bags import CAR, IMAGES, still_views
+    from nodes.lab.wizards.bags import CAR, IMAGES, origin_remark, still_views
     from nodes.lab.wizards.lens import load_lens, with_kept
 
     keep_inputs(output, source, lens, pattern)
@@ -193,6 +193,8 @@ def camera_to_car(
     fit = calibrate_mount(views, camera, None if pattern is None else _transform(pattern))
     new = with_kept(fit.calibration(camera), output)
     save_and_print(new, output, lambda figure: mount_plot(figure, fit))
+    if remark := origin_remark(bag):
+        print(remark)
     if new.latency_s:
         print(f"latency_s {new.latency_s:g} is kept from the old file")
 
@@ -218,12 +220,13 @@ def vehicle(
     from calibration.plots import vehicle_plot
     from calibration.schema import VehicleCalibration, load_calibration
     from calibration.vehicle import fit_gains
-    from calibration.vehicle_response import fit_response, vehicle_calibration
-    from nodes.lab.wizards.bags import CAR, SENT, read_drive
+    from calibration.vehicle_response import fit_response, remarks, vehicle_calibration
+    from nodes.lab.wizards.bags import CAR, SENT, origin_remark, read_drive
 
     keep_inputs(output, source, before)
     old = load_calibration(VehicleCalibration, before)
-    drive = read_drive(_source(source, live, (CAR, SENT), output))
+    bag = _source(source, live, (CAR, SENT), output)
+    drive = read_drive(bag)
     gains = fit_gains(drive, wheelbase_m or old.wheelbase_m)
     response = fit_response(drive, gains)
     new = vehicle_calibration(gains, response, old)
@@ -232,6 +235,8 @@ def vehicle(
     print(
         f"servo {g.servo_per_rad:.4f} per rad, offset {g.servo_offset:.4f}; {g.erpm_per_mps:.1f} erpm per m/s"
     )
+    for line in (*remarks(new, old), *filter(None, [origin_remark(bag)])):
+        print(line)
     if abs(ahead) > 10.0:
         print(
             f"the subject's origin is {ahead:.0f} mm ahead of the rear axle. Move it to the rear axle in Tracker, or every cross-track error is wrong"

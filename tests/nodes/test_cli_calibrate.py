@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import typer
 import yaml
+from scipy.spatial.transform import Rotation
 
 from advnerf_core.geometry import camera_mount, make_transform, planar_pose
 from calibration.by_construction import twin_calibrations
@@ -66,9 +67,9 @@ def write_poses(writer, topic, when, poses):
         writer.write(topic, encode(pose_message(T, ns(t))), ns(t), ns(t), k)
 
 
-def drive_bag(folder, recorded):
+def drive_bag(folder, recorded, pose_of=lambda row: planar_pose(*row)):
     with BagWriter(folder) as writer:
-        write_poses(writer, "/vicon/car", recorded.pose_s, [planar_pose(*row) for row in recorded.poses])
+        write_poses(writer, "/vicon/car", recorded.pose_s, [pose_of(row) for row in recorded.poses])
         for k, t in enumerate(recorded.command_s):
             sent = filled(
                 types.MotorSent,
@@ -104,13 +105,49 @@ def test_vehicle_from_a_bag(tmp_path, capsys):
     assert found.response.pipeline_delay_s == pytest.approx(0.04, abs=1e-3)
     assert found.limits == load_calibration(VehicleCalibration, tmp_path / "before.yaml").limits
     assert cv2.imread(str(tmp_path / "new" / "vehicle.png")).shape[1] > 500
-    assert "attack: {response: {delay_s:" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "attack: {response: {delay_s:" in said
+    assert "warning" not in said
     # The drive holds no camera: said in one line, and nothing is written.
     camera = tmp_path / "camera.yaml"
     save_calibration(twin_calibrations(LabConfig())["camera"], camera)
     assert run("car", "calibrate", "time-offset", bag, "--camera", camera, "-o", tmp_path / "no.yaml") == 2
     assert "expected images on /camera/image_raw or " in capsys.readouterr().err
     assert not (tmp_path / "no.yaml").exists()
+
+
+def test_what_of_a_vehicle_is_far_from_the_file_of_the_drive_is_remarked(tmp_path, capsys):
+    """Poses of half the size, limits beyond the servo, and a subject whose origin is 150 mm up were written without a word."""
+    before = twin_calibrations(LabConfig())["vehicle"]
+    wide = {"steering_min_rad": -0.6, "steering_max_rad": 0.6}
+    save_calibration(
+        before.model_copy(update={"limits": before.limits.model_copy(update=wide)}), tmp_path / "before.yaml"
+    )
+    recorded = drive(np.random.default_rng(0), program(hold_s=1.6, steps=8))
+    tilted = make_transform(Rotation.from_euler("y", 6.0, degrees=True).as_matrix(), [0.0, 0.0, 0.15])
+
+    def in_double_metres(row):
+        return planar_pose(*(row / [2.0, 2.0, 1.0])) @ tilted
+
+    bag = drive_bag(tmp_path / "bag", recorded, in_double_metres)
+    assert (
+        run(
+            "car",
+            "calibrate",
+            "vehicle",
+            bag,
+            "--before",
+            tmp_path / "before.yaml",
+            "-o",
+            tmp_path / "v.yaml",
+        )
+        == 0
+    )
+    said = " ".join(capsys.readouterr().out.split())
+    assert "warning: erpm_per_mps is" in said
+    assert "2 times that of --before" in said
+    assert "the limits that are kept are -0.600 to +0.600 rad" in said
+    assert "got the origin +150 mm from the floor and the axis 6.0 degrees off" in said
 
 
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

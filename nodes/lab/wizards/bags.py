@@ -42,6 +42,8 @@ _WIDEST_M = 1000.0
 _STEEPEST, _LIFTED_M = 0.5, 0.5
 # Largest distance of a pose from their mean [m].
 _MOST_MOTION_M = 0.004
+# Markers' noise and floors are less off.
+_MOST_HEIGHT_MM, _MOST_TILT_DEG = 20.0, 1.5
 # Largest angle of a pose from their mean [rad].
 _MOST_TURN_RAD = 0.008
 # Poses of one stop differ less, those of two more.
@@ -109,6 +111,20 @@ def require_metres_and_z_up(T: Array, bag: Path, topic: str) -> None:
             f"expected a car that drives on a floor on {topic} in {bag}, got {z_m:.2f} m up and down, {x_m:.2f} m along x and {y_m:.2f} m along y: is y up "
             "in motion capture? Set z up"
         )
+
+
+def origin_remark(bag: Path) -> str:
+    """A warning if the car's subject has its origin above or below the floor, or axes that are not level; empty if it has not."""
+    T = read_poses(bag, CAR).T
+    height_mm = 1000.0 * float(np.median(T[:, 2, 3]))
+    tilt_deg = float(np.degrees(np.median(np.arccos(np.clip(T[:, 2, 2], -1.0, 1.0)))))
+    if abs(height_mm) <= _MOST_HEIGHT_MM and tilt_deg <= _MOST_TILT_DEG:
+        return ""
+    return (
+        f"warning: expected a subject whose origin is on the floor and whose z axis points up, got the origin {height_mm:+.0f} mm from the floor and the "
+        f"axis {tilt_deg:.1f} degrees off. Move it in Tracker before you calibrate: simulated cars stand on their origin, and the camera's height and "
+        "pitch would be wrong there by as much"
+    )
 
 
 def read_frames(bag: Path) -> Iterator[tuple[int, Rgb]]:
