@@ -81,6 +81,10 @@ def start_before_corner(path: Path, corner: int, before_m: float) -> tuple[float
     """
     starts = np.concatenate([[0.0], np.cumsum([piece.length_m for piece in path.segments])])
     corners = [float(s) for s, piece in zip(starts, path.segments, strict=False) if isinstance(piece, Arc)]
+    if not corners:
+        raise DegenerateDataError(
+            f"expected a path with corners, one of which the start is {before_m:g} m before, got a straight one; record a way with a turn"
+        )
     if not 1 <= corner <= len(corners):
         raise DegenerateDataError(
             f"expected a corner from 1 to {len(corners)}, the arcs of the path, got {corner}"

@@ -221,12 +221,14 @@ def vehicle(
     from calibration.schema import VehicleCalibration, load_calibration
     from calibration.vehicle import fit_gains
     from calibration.vehicle_response import fit_response, remarks, vehicle_calibration
+    from nodes.bags.one_clock import require_one_clock
     from nodes.lab.wizards.bags import CAR, SENT, origin_remark, read_drive
 
     keep_inputs(output, source, before)
     old = load_calibration(VehicleCalibration, before)
     bag = _source(source, live, (CAR, SENT), output)
     drive = read_drive(bag)
+    require_one_clock(bag, (CAR, SENT))
     gains = fit_gains(drive, wheelbase_m or old.wheelbase_m)
     response = fit_response(drive, gains)
     new = vehicle_calibration(gains, response, old)
@@ -277,12 +279,15 @@ def time_offset(
     from calibration.plots import offset_plot
     from calibration.schema import CameraCalibration, load_calibration, save_calibration
     from calibration.time_offset import fit_offset, image_turns
+    from nodes.bags.images import image_topic
+    from nodes.bags.one_clock import require_one_clock
     from nodes.lab.wizards.bags import CAR, IMAGES, camera_of, read_frames, read_poses
 
     keep_inputs(output, source, camera)
     known = load_calibration(CameraCalibration, camera)
     bag = _source(source, live, (IMAGES, CAR), output, {"camera.yaml": camera.read_bytes()})
     poses = read_poses(bag, CAR)
+    require_one_clock(bag, (image_topic(bag), CAR))
     start = int(poses.stamps_ns[0])
     turns = image_turns((((stamp - start) / 1e9, image) for stamp, image in read_frames(bag)), known)
     yaw = np.unwrap(np.arctan2(poses.T[:, 1, 0], poses.T[:, 0, 0]))

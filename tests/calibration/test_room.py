@@ -101,6 +101,11 @@ def test_a_walk_whose_way_was_not_seen_is_no_fence():
         fence_from_trace(notched[:-300], 0.3)
 
 
+def test_a_straight_path_has_no_corner_to_start_before():
+    with pytest.raises(DegenerateDataError, match=r"path with corners, .* got a straight one"):
+        start_before_corner(Path((0.0, 0.0, 0.0), [Line(4.0)], closed=False), 1, 1.0)
+
+
 def test_the_start_is_so_far_before_the_corner():
     # The bottom straight ends at x = 0.9, where the first corner begins.
     assert start_before_corner(SQUARE, 1, 1.5) == pytest.approx((-0.6, -2.0, 0.0), abs=1e-4)

@@ -70,18 +70,22 @@ def write_poses(writer, topic, when, poses):
 def drive_bag(folder, recorded, pose_of=lambda row: planar_pose(*row)):
     with BagWriter(folder) as writer:
         write_poses(writer, "/vicon/car", recorded.pose_s, [pose_of(row) for row in recorded.poses])
-        for k, t in enumerate(recorded.command_s):
-            sent = filled(
-                types.MotorSent,
-                header=header(ns(t - recorded.pipeline_s[k]), "car"),
-                serial_write_mono_ns=1,
-                serial_write_real_ns=ns(t),
-                erpm=float(recorded.erpm[k]),
-                servo=float(recorded.servo[k]),
-                peer="twin",
-            )
-            writer.write("/motor/sent", encode(sent), ns(t), ns(t), k)
+        write_sent(writer, recorded)
     return folder
+
+
+def write_sent(writer, recorded):
+    for k, t in enumerate(recorded.command_s):
+        sent = filled(
+            types.MotorSent,
+            header=header(ns(t - recorded.pipeline_s[k]), "car"),
+            serial_write_mono_ns=1,
+            serial_write_real_ns=ns(t),
+            erpm=float(recorded.erpm[k]),
+            servo=float(recorded.servo[k]),
+            peer="twin",
+        )
+        writer.write("/motor/sent", encode(sent), ns(t), ns(t), k)
 
 
 def test_vehicle_from_a_bag(tmp_path, capsys):
@@ -148,6 +152,25 @@ def test_what_of_a_vehicle_is_far_from_the_file_of_the_drive_is_remarked(tmp_pat
     assert "2 times that of --before" in said
     assert "the limits that are kept are -0.600 to +0.600 rad" in said
     assert "got the origin +150 mm from the floor and the axis 6.0 degrees off" in said
+
+
+def test_clocks_that_differ_are_named_and_not_the_drive(tmp_path, capsys):
+    """Poses an hour off left no stretch with commands: 'hold each command for 1.3 s or more'."""
+    before = tmp_path / "before.yaml"
+    save_calibration(twin_calibrations(LabConfig())["vehicle"], before)
+    recorded = drive(np.random.default_rng(0), program(hold_s=1.6, steps=8))
+    with BagWriter(tmp_path / "bag") as writer:
+        for k, (at_s, row) in enumerate(zip(recorded.pose_s, recorded.poses, strict=True)):
+            message = encode(pose_message(planar_pose(*row), ns(at_s - 3600.0)))
+            writer.write("/vicon/car", message, ns(at_s), ns(at_s), k)
+        write_sent(writer, recorded)
+    assert (
+        run("car", "calibrate", "vehicle", tmp_path / "bag", "--before", before, "-o", tmp_path / "v.yaml")
+        == 2
+    )
+    said = capsys.readouterr().err
+    assert "expected stamps of one clock" in said
+    assert "/vicon/car 3.6e+03 s before" in said
 
 
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
