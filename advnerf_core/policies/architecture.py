@@ -195,6 +195,25 @@ class Architecture:
                     f"{type(error).__name__}: {error}"
                 ) from error
             self._require_steady(network)
+            self._require_all_stored(network)
+
+    def _require_all_stored(self, network: SteeringNetwork) -> None:
+        """Raise unless another network of this architecture answers as this one once it has its weights: files keep nothing else."""
+        import torch
+
+        other, images, goals = (
+            self.build(2, 0.3).eval(),
+            torch.rand(2, 3, IMAGE_HEIGHT, IMAGE_WIDTH),
+            torch.eye(2),
+        )
+        other.load_state_dict(network.state_dict())
+        expected, got = network(images, goals), other(images, goals)
+        if not torch.allclose(expected, got, rtol=1e-4, atol=1e-6):
+            raise ArchitectureError(
+                f"{_WHAT} {self.name}: expected the same answers from a network that loads the weights of another, got "
+                f"{float(got[0]):.4f} rad for {float(expected[0]):.4f} rad: what is not in state_dict() is neither trained nor stored; hold "
+                "layers in torch.nn.ModuleList, and tensors in torch.nn.Parameter or register_buffer"
+            )
 
     def _require_steady(self, network: SteeringNetwork) -> None:
         from advnerf_core.geometry import Pinhole

@@ -46,6 +46,7 @@ class DrivenRig:
         speed_mps: The car's speed [m/s].
         dt_s: Time between two pictures [s].
         wheelbase_m: Distance between the axles [m]; None for a car whose control is a turn rate.
+        control_limits: Rightmost and leftmost control of the car, which clamps others.
     """
 
     pinhole: Pinhole
@@ -53,6 +54,7 @@ class DrivenRig:
     speed_mps: float
     dt_s: float
     wheelbase_m: float | None
+    control_limits: tuple[float, float]
 
     @cached_property
     def tracker(self) -> TrackedTrajectory:
@@ -66,11 +68,12 @@ class DrivenRig:
         )
 
     def turn_rate_radps(self, control: float) -> float:
-        """Turn rate of the car under a control."""
+        """Turn rate of the car under a control, which it clamps at its limits."""
+        clamped = float(np.clip(control, *self.control_limits))
         return (
-            control
+            clamped
             if self.wheelbase_m is None
-            else self.speed_mps * float(np.tan(control)) / self.wheelbase_m
+            else self.speed_mps * float(np.tan(clamped)) / self.wheelbase_m
         )
 
 

@@ -112,7 +112,7 @@ def test_our_client_and_our_server_agree_and_each_session_has_its_own_memory():
 
     network = adapt(changes, PolicyContract(VIEW, frames=stack))
     served = ServedPolicy(TorchDriver(LoadedPolicy(network, VIEW, {}, "cd" * 32)), "changes", ServedCar(0.3))
-    rig = DrivenRig(PINHOLE, camera_mount(0.3, 0.1, 0.2, 0.17), 0.8, 0.1, 0.3)
+    rig = DrivenRig(PINHOLE, camera_mount(0.3, 0.1, 0.2, 0.17), 0.8, 0.1, 0.3, (-0.3, 0.3))
     images = torch.rand(4, 2, 3, 36, 64, generator=torch.Generator().manual_seed(0)) * torch.rand(
         4, 2, 1, 1, 1
     )

@@ -80,7 +80,9 @@ def _driver_at(experiment: Experiment, address: str, expected_sha256: str | None
         )
     camera, car = experiment.camera, experiment.car
     view = PolicyView(camera, 0, camera.height, camera.width, camera.height)
-    rig = DrivenRig(camera, experiment.mount, car.speed_mps, experiment.config.dt_s, car.wheelbase_m)
+    rig = DrivenRig(
+        camera, experiment.mount, car.speed_mps, experiment.config.dt_s, car.wheelbase_m, car.control_limits
+    )
     return load_driver_at(address, view, rig, expected_sha256)
 
 

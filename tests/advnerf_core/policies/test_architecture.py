@@ -300,17 +300,29 @@ def test_what_cannot_be_built_is_one_clear_error(name, configuration, message) -
             "self.head(images[:, :, 0, 0] - images[:, :, 0, 0].mean(0))[:, 0]",
             "answers a picture always the same: an image steers differently in a batch than alone",
         ),
+        (
+            "nn.Linear(3, 1)",
+            "self.head(self.hidden[0](images[:, :, 0, 0]))[:, 0]",
+            r"that loads the weights of another.*hold layers in torch.nn.ModuleList",
+        ),
+        (
+            "nn.Linear(3, 1)",
+            "self.head(images[:, :, 0, 0] @ self.mixed)[:, 0]",
+            r"that loads the weights of another.*tensors in torch.nn.Parameter or register_buffer",
+        ),
     ],
 )
 def test_a_check_finds_a_network_that_would_be_trained_for_nothing(tmp_path, layers, output, message) -> None:
     """Noise and memories were trained and saved without a word, and told as the effect of an attack."""
     (tmp_path / "own.py").write_text(
+        "import torch\n"
         "from torch import nn\n"
         "from advnerf_core.policies.network import SteeringNetwork\n"
         "class Own(SteeringNetwork):\n"
         "    def __init__(self, goal_size, max_steering_rad, configuration):\n"
         "        super().__init__(goal_size, max_steering_rad, configuration)\n"
         f"        self.head, self.count = {layers}, 0\n"
+        "        self.hidden, self.mixed = [nn.Linear(3, 3)], torch.randn(3, 3)\n"
         "    def asked(self):\n"
         "        self.count += 1\n"
         "        return self.count\n"

@@ -25,8 +25,11 @@ PINHOLE = Pinhole(40, 24, 30.0, 31.0, 19.0, 12.5)
 VIEW = PolicyView(PINHOLE, 0, PINHOLE.height, PINHOLE.width, PINHOLE.height)
 MOUNT = camera_mount(0.3, 0.1, 0.2, 0.17)
 RADIUS_M, WHEELBASE_M, SPEED_MPS, DT_S = 2.0, 0.3, 0.8, 0.1
-ACKERMANN = DrivenRig(PINHOLE, MOUNT, SPEED_MPS, DT_S, WHEELBASE_M)
-DUBINS = DrivenRig(PINHOLE, MOUNT, SPEED_MPS, DT_S, None)
+ACKERMANN = DrivenRig(PINHOLE, MOUNT, SPEED_MPS, DT_S, WHEELBASE_M, (-0.3, 0.3))
+DUBINS = DrivenRig(PINHOLE, MOUNT, SPEED_MPS, DT_S, None, (-1.0, 1.0))
+# Their circle is tighter than these cars can drive.
+STIFF = DrivenRig(PINHOLE, MOUNT, SPEED_MPS, DT_S, WHEELBASE_M, (-0.1, 0.1))
+SLOW = DrivenRig(PINHOLE, MOUNT, SPEED_MPS, DT_S, None, (-0.3, 0.3))
 
 
 def arc(radius_m: float, along_m: Array) -> Array:
@@ -72,9 +75,17 @@ def served(driver: BaseDriver) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    ("rig", "control"), [(ACKERMANN, np.arctan(WHEELBASE_M / RADIUS_M)), (DUBINS, SPEED_MPS / RADIUS_M)]
+    ("rig", "control", "turn_radps"),
+    [
+        (ACKERMANN, np.arctan(WHEELBASE_M / RADIUS_M), SPEED_MPS / RADIUS_M),
+        (DUBINS, SPEED_MPS / RADIUS_M, SPEED_MPS / RADIUS_M),
+        (STIFF, np.arctan(WHEELBASE_M / RADIUS_M), SPEED_MPS * math.tan(0.1) / WHEELBASE_M),
+        (SLOW, SPEED_MPS / RADIUS_M, 0.3),
+    ],
 )
-def test_a_driver_steers_and_is_told_camera_pictures_and_poses(rig: DrivenRig, control: float) -> None:
+def test_a_driver_steers_and_is_told_camera_pictures_and_poses(
+    rig: DrivenRig, control: float, turn_radps: float
+) -> None:
     driver, ticks, cars = OnACircle(), 5, 2
     images = torch.rand(
         ticks, cars, 3, PINHOLE.height, PINHOLE.width, generator=torch.Generator().manual_seed(0)
@@ -90,7 +101,7 @@ def test_a_driver_steers_and_is_told_camera_pictures_and_poses(rig: DrivenRig, c
     for number, picture in enumerate(driver.pictures):
         sent = images[number // cars, number % cars].permute(1, 2, 0).numpy()
         assert np.abs(picture / 255.0 - sent).max() <= 0.51 / 255.0
-    radius_m = SPEED_MPS / rig.turn_rate_radps(control)
+    radius_m = SPEED_MPS / turn_radps
     for number, pose in enumerate(driver.poses):
         along_m = SPEED_MPS * DT_S * (number // cars)
         assert pose == pytest.approx((*arc(radius_m, np.array([along_m]))[0], along_m / radius_m), abs=1e-3)
