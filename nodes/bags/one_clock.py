@@ -15,6 +15,8 @@ from nodes.runtime.errors import BagError
 
 # Delays from stamp to recording differ by less between topics of one clock, also over Wi-Fi.
 _MOST_APART_S = 0.5
+# No link is faster than light: stamps this long after their recording are of another clock, if those of another topic are this far from them.
+_MOST_AHEAD_S, _ENOUGH_APART_S = 0.05, 0.1
 # Delays are compared in stretches of this length, in each from at least this many messages: a clock may drift, or be set in the middle.
 _STRETCH_S, _ENOUGH = 5.0, 3
 # A stretch in which the recorder's clock was set proves nothing.
@@ -32,15 +34,24 @@ def require_one_clock(bag: Path, topics: Sequence[str]) -> None:
         OneClockError: The delays of two topics, from stamp to recording, differ by more than any link explains.
     """
     stretches = [each for each in _delays_s(bag, topics) if len(each) > 1]
-    apart = [each for each in stretches if max(each.values()) - min(each.values()) > _MOST_APART_S]
+    apart = [each for each in stretches if _apart_s(each) > _most_apart_s(each)]
     if len(apart) < min(_STRETCHES, len(stretches)) or not apart:
         return
-    worst = max(apart, key=lambda each: max(each.values()) - min(each.values()))
+    worst = max(apart, key=_apart_s)
     last, first = max(worst, key=worst.__getitem__), min(worst, key=worst.__getitem__)
     raise OneClockError(
         f"{bag}: expected stamps of one clock, got those of {first} {_beside(worst[first])} their recording, and those of {last} "
         f"{_beside(worst[last])} it; set the clocks of all computers (chrony) and record again"
     )
+
+
+def _apart_s(delays_s: Mapping[str, float]) -> float:
+    return max(delays_s.values()) - min(delays_s.values())
+
+
+def _most_apart_s(delays_s: Mapping[str, float]) -> float:
+    """How far delays of one clock may be apart [s]: less if one topic was recorded before its stamp."""
+    return _ENOUGH_APART_S if min(delays_s.values()) < -_MOST_AHEAD_S else _MOST_APART_S
 
 
 def _delays_s(bag: Path, topics: Sequence[str]) -> Iterator[Mapping[str, float]]:

@@ -17,7 +17,7 @@ from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.view import PolicyView
-from nodes.bags.one_clock import OneClockError
+from nodes.bags.one_clock import OneClockError, require_one_clock
 from nodes.bags.reader import read_attachments, read_messages
 from nodes.bags.writer import BagWriter
 from nodes.lab.importing.driven_bag import BagConfig, take_frames
@@ -334,6 +334,18 @@ def test_poses_of_another_clock_are_refused(tmp_path, shift_s, said):
         open_log(bag)
     with pytest.raises(OneClockError, match="expected stamps of one clock"):
         take_frames(bag, tmp_path / "images", BagConfig(), lambda *_: None, TWIN_CAMERA)
+
+
+@pytest.mark.parametrize(("shift_s", "refused"), [(0.3, True), (0.15, True), (-0.3, False), (0.04, False)])
+def test_stamps_after_their_recording_are_of_another_clock(tmp_path, shift_s, refused):
+    """A link that is 0.3 s late is possible, one that delivers before the capture is not."""
+    bag = poses_of_another_clock(tmp_path / "other", write_bag(tmp_path / "bag"), round(shift_s * 10**9))
+    topics = ("/camera/image_raw", "/vicon/car")
+    if not refused:
+        require_one_clock(bag, topics)
+        return
+    with pytest.raises(OneClockError, match=rf"those of /vicon/car {shift_s:g} s after their recording"):
+        require_one_clock(bag, topics)
 
 
 def test_the_rate_is_that_of_the_stamps(tmp_path):
