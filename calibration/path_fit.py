@@ -38,6 +38,8 @@ _POINTS = 600
 _CLOSING_M = 0.3
 # A fit with a larger error is rejected [m].
 _WORST_RMS_M = 0.05
+# A car that turned back within this had a turning radius of 0.2 m; small ones have 0.3 to 0.8 m.
+_TURN_BACK_M, _TURN_BACK_RAD = 0.5, 2.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +106,7 @@ def fit_path(trace: ArrayLike, closed: bool | None = None) -> PathFit:
             "or draw it smoothly along the tape, at walking pace, in one direction"
         )
     _require_along_trace(fit)
+    _require_drivable(fit)
     return fit
 
 
@@ -116,6 +119,19 @@ def _require_along_trace(fit: PathFit) -> None:
         raise DegenerateDataError(
             f"expected a path along the trace, got one whose point {xy[worst, 0]:.2f}, {xy[worst, 1]:.2f} m is {away_m[worst]:.2f} m from the nearest "
             "place of the trace: was the way driven there and back? Drive it in one direction"
+        )
+
+
+def _require_drivable(fit: PathFit) -> None:
+    """Refuse a path that turns back on the spot, as that of a way there and back does."""
+    x_m, y_m, yaw_rad = fit.path.pose_at(np.arange(0.0, fit.path.length_m, _STEP_M)).T
+    reach = round(_TURN_BACK_M / _STEP_M)
+    turned_rad = np.abs(np.unwrap(yaw_rad)[reach:] - np.unwrap(yaw_rad)[:-reach])
+    at = int(turned_rad.argmax())
+    if turned_rad[at] > _TURN_BACK_RAD:
+        raise DegenerateDataError(
+            f"expected a path that a car can drive, got one that turns by {np.degrees(turned_rad[at]):.0f} degrees within {_TURN_BACK_M:g} m at "
+            f"{x_m[at + reach // 2]:.2f}, {y_m[at + reach // 2]:.2f} m: was the way driven there and back? Drive it in one direction"
         )
 
 

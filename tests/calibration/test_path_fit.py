@@ -84,6 +84,25 @@ def test_a_way_there_and_back_gives_no_path_where_nobody_was():
         fit_path(np.stack([along, np.zeros_like(along)], axis=1) + noise)
 
 
+@pytest.mark.parametrize("turn_rad", [0.8, 1.57])
+def test_a_way_there_and_back_with_a_turn_gives_no_path(turn_rad):
+    """It is nowhere far from the trace, and turns back with a radius of 0.1 m at its end."""
+    way = Path.from_segments((0.0, 0.0, 0.0), [Line(1.5), Arc(0.8, turn_rad), Line(1.5)], closed=False)
+    there = way.pose_at(np.arange(0.0, way.length_m, 0.008))[:, :2]
+    both = np.concatenate([there, there[::-1]])
+    noise = np.random.default_rng(0).normal(0.0, 0.002, both.shape)
+    with pytest.raises(DegenerateDataError, match="in one direction"):
+        fit_path(both + noise)
+
+
+@pytest.mark.parametrize("radius_m", [0.25, 0.4])
+def test_the_turns_of_small_cars_are_drivable(radius_m):
+    track = Path.from_segments(
+        (0.0, 0.0, 0.0), [Line(1.0), Arc(radius_m, np.pi), Line(1.0), Arc(radius_m, np.pi)], closed=True
+    )
+    assert fit_path(driven(track, 1.05)).rms_m < 0.02
+
+
 def test_standing_still_before_and_after_changes_nothing():
     rng = np.random.default_rng(1)
     trace = driven(SQUARE, 1.05)
