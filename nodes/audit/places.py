@@ -26,6 +26,7 @@ from nodes.lab.worlds.named import NamedWorld, read_world
 from nodes.lab.worlds.photographs.config import DRIVEN
 from nodes.lab.worlds.photographs.world import PATH, Photographs
 from nodes.runtime.config import apply_overrides
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.paths import shipped
 
 _DRIVEN_POSES = "transforms_car.json"
@@ -33,6 +34,8 @@ _DRIVEN_POSES = "transforms_car.json"
 _ROUND = 3.0
 # Relative to the extent of the cameras: nothing is learned beyond. A place with more distant walls fails on its held-out views.
 _REACH = 1.5
+# A height that was measured by hand, to the lens.
+_HEIGHT_OFF_M, _HEIGHT_OFF = 0.05, 0.25
 _WORLD = "world."
 
 
@@ -80,8 +83,9 @@ def place_of_photographs(
         of_car["speed_mps"] = answers.speed_mps
     height_m = answers.camera_height_m or car.camera_height_m
     # Photographs that do not show a drive were taken at another height.
-    if height_m is None and there.ground_at_zero and (path == DRIVEN or path.endswith(".json")):
-        height_m = _height_m(there.poses if path == DRIVEN else Path(path))
+    if there.ground_at_zero and (path == DRIVEN or path.endswith(".json")):
+        seen_m = _height_m(there.poses if path == DRIVEN else Path(path))
+        height_m = _require_same_height(height_m or seen_m, seen_m)
     height_m = answer(height_m, "--camera-height", "Height of the driving camera above the ground [m]", float)
     world: dict[str, Any] = {
         "kind": "photographs",
@@ -116,6 +120,20 @@ def _height_m(poses: Path) -> float:
     """Height of the driving camera above the ground at z = 0, in the middle of its photographs [m]."""
     frames = load_transforms(poses, require_all=True).frames
     return round(float(np.median([each.T_world_from_camera[2, 3] for each in frames])), 4)
+
+
+def _require_same_height(height_m: float, seen_m: float) -> float:
+    """The height that was given, if the photographs of the drive were taken there.
+
+    Raises:
+        ConfigError: They were not: the policy would see another place than its car.
+    """
+    if abs(height_m - seen_m) > max(_HEIGHT_OFF_M, _HEIGHT_OFF * seen_m):
+        raise ConfigError(
+            f"expected the height of the driving camera in its photographs, {seen_m:g} m above the ground, got {height_m:g} m; leave --camera-height (or "
+            "camera_height_m of the car) out, or correct the scale of the place"
+        )
+    return height_m
 
 
 def camera_of(there: PosedPlace, path: str | None) -> Pinhole:

@@ -42,6 +42,8 @@ _UNBOUNDED = 16
 
 
 Facts = dict[str, Any]
+# Cars of a motion-capture world drive at z = 0, see advnerf_core.geometry.planar_pose.
+_MOCAP: Facts = {"scale": "metric: motion capture", "ground_at_zero": True}
 
 
 def from_media(
@@ -95,7 +97,7 @@ def from_bag(
     def build(folder: Path) -> Facts:
         frames = take_frames(bag, folder / IMAGES / CAR_CAMERA, config, report, calibration)
         positions = frames.T_world_from_camera[:, :3, 3]
-        facts = {"bag": str(bag), **_bag_facts(frames), "scale": "metric: motion capture"}
+        facts = {"bag": str(bag), **_bag_facts(frames), **_MOCAP}
         reach = np.concatenate([positions - margin_m, positions + margin_m])
         _write_car(folder / TRANSFORMS, frames, {**_box(reach, margin=0.0), "world": "mocap"})
         return _reported(folder, facts)
@@ -150,7 +152,7 @@ def from_phone_and_car(
             **_bag_facts(frames),
             "structure_from_motion": model.summary(),
             "placing": placed.summary(),
-            "scale": "metric: motion capture",
+            **_MOCAP,
         }
         return _write_joint(folder, model, placed, frames, facts)
 

@@ -197,6 +197,15 @@ def test_a_path_from_a_file_takes_ground_and_pitch_from_the_changes_of_the_exper
         )
     driven, _ = place_of_photographs(tmp_path / "photos", on_ground, Answers(0.4), CARS["donkey"], None)
     assert driven.world["camera"]["z_m"] == pytest.approx(0.3)
+    for height_m, seen in ((0.34, True), (0.25, True), (0.6, False), (0.1, False)):
+        asked = (tmp_path / "photos", on_ground, Answers(0.4, None, height_m), CARS["donkey"], None)
+        if seen:
+            assert place_of_photographs(*asked)[0].world["camera"]["z_m"] == height_m
+        else:
+            with pytest.raises(
+                ConfigError, match=rf"in its photographs, 0\.3 m above the ground, got {height_m} m"
+            ):
+                place_of_photographs(*asked)
 
 
 def test_a_learned_scene_without_its_images_cannot_be_judged_in(tmp_path: Path) -> None:

@@ -52,7 +52,9 @@ def test_a_data_set_of_a_bag_reads_back_with_frames_poses_and_camera(tmp_path, w
     low, high = listed.box()
     assert (low <= positions.min(axis=0) - 1.99).all()
     assert (high >= positions.max(axis=0) + 1.99).all()
-    assert json.loads((output / "import.json").read_text())["taken_frames"] == len(listed.frames)
+    told = json.loads((output / "import.json").read_text())
+    assert told["taken_frames"] == len(listed.frames)
+    assert told["ground_at_zero"], "an audit there need not ask for the camera's height"
 
 
 def test_frames_in_a_gap_of_the_motion_capture_are_left_out_and_counted(tmp_path, write_bag):
