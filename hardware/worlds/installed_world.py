@@ -9,6 +9,7 @@ import numpy as np
 
 from advnerf_core.geometry import Array
 from hardware.worlds.environments import ENVIRONMENTS
+from hardware.worlds.remote_errors import ServerLost, SimulatorError
 from hardware.worlds.remote_world import RemoteMeshWorld
 from hardware.worlds.road_photos import road_photo_poses
 
@@ -49,6 +50,15 @@ class InstalledWorld(RemoteMeshWorld):
     def python(self) -> Path:
         """The interpreter of the world's environment; see `RemoteWorld.python`."""
         return self._environment.python()
+
+    def _open(self) -> None:
+        try:
+            super()._open()
+        except (ServerLost, SimulatorError) as error:
+            raise type(error)(
+                f"{error}; expected these Debian packages, or what others call them: {' '.join(self._environment.system)}; install them, or see what the "
+                "simulator said"
+            ) from None
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
         """Poses along, beside and above the driven paths; see `road_photo_poses`."""

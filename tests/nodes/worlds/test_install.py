@@ -10,13 +10,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from advnerf_core.documents import Document
 from advnerf_core.files import sha256_of
 from hardware.worlds import WORLDS
 from hardware.worlds.environments import ENVIRONMENTS, FOLDER_VARIABLE, MADE, Environment
-from hardware.worlds.remote_errors import WorldNotInstalled
+from hardware.worlds.remote_errors import ServerLost, SimulatorError, WorldNotInstalled
 from nodes.cli.main import app
 from nodes.lab.plugin_tables import TABLES, rows_of
 from nodes.lab.worlds.install import InstallError, find_python, install
+from nodes.lab.worlds.named import read_world
 
 HERE = f"{sys.version_info[0]}.{sys.version_info[1]}"
 
@@ -111,6 +113,30 @@ def test_the_list_says_what_is_installed(tmp_path: Path, monkeypatch: pytest.Mon
     environment.interpreter.touch()
     (environment.folder / MADE).write_text(json.dumps({"lock_sha256": sha256_of(environment.lock)}))
     assert "installed" not in line()
+
+
+@pytest.mark.parametrize("dies", ["os._exit(7)", "raise RuntimeError('no driver')"])
+def test_a_simulator_that_does_not_open_is_told_with_the_packages_that_it_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dies: str
+) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    environment = ENVIRONMENTS["filament"]
+    environment.interpreter.parent.mkdir(parents=True)
+    environment.interpreter.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n')
+    environment.interpreter.chmod(0o755)
+    (environment.folder / MADE).write_text(json.dumps({"lock_sha256": sha256_of(environment.lock)}))
+    broken = tmp_path / "broken.py"
+    broken.write_text(f"import os\ndef open_simulator(config, cameras, **files):\n    {dies}\n")
+    monkeypatch.setattr(Environment, "simulator", broken)
+    world = read_world(Document({"kind": "filament"}, "test"), Path.cwd()).make()
+    with (
+        pytest.raises(
+            (ServerLost, SimulatorError), match="libvulkan1 mesa-vulkan-drivers; install them"
+        ) as told,
+        world,
+    ):
+        raise AssertionError("it was opened")
+    assert "run it again" not in str(told.value)
 
 
 def test_nothing_is_installed_before_its_licence_is_accepted(
