@@ -14,6 +14,7 @@ from gym_duckietown.graphics import create_frame_buffers
 from pyglet import gl
 
 NEAR_M, FAR_M = 0.04, 100.0  # as in Duckietown's projection
+_BACK = np.full((1, 1, 3), 51, np.uint8)  # of panels
 
 
 class PygletView:
@@ -66,7 +67,7 @@ class PygletPanel:
     """A textured rectangle that is lit like everything else; its back is plain."""
 
     def __init__(self, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> None:
-        self._texture = _texture(rgb[::-1], True)
+        self._front, self._back = _texture(rgb[::-1], True), _texture(_BACK, False)
         R, at, u, v = T_world_from_face[:3, :3], T_world_from_face[:3, 3], 0.5 * size_m[0], 0.5 * size_m[1]
         self._normal = to_opengl(R[:, 0])
         # For a viewer left is against the face's y; the texture's origin is at its lower left.
@@ -77,18 +78,19 @@ class PygletPanel:
 
     def render(self, draw_bbox: bool, segment: bool, enable_leds: bool) -> None:
         """Called by Duckietown for each of its objects."""
-        with _textured(self._texture):
-            self._draw(self._corners, self._normal, 1.0)
-            gl.glDisable(gl.GL_TEXTURE_2D)
-            self._draw(self._corners[::-1], -self._normal, 0.2)
+        with _textured(self._front):
+            self._draw(self._corners, self._normal)
+            gl.glBindTexture(gl.GL_TEXTURE_2D, self._back)
+            self._draw(self._corners[::-1], -self._normal)
 
     def delete(self) -> None:
         """Give its memory back."""
-        gl.glDeleteTextures(1, ctypes.byref(self._texture))
+        for each in (self._front, self._back):
+            gl.glDeleteTextures(1, ctypes.byref(each))
 
-    def _draw(self, corners: list[Any], normal: np.ndarray, brightness: float) -> None:
-        """Draw one side of the panel."""
-        gl.glColor4f(brightness, brightness, brightness, 1.0)
+    def _draw(self, corners: list[Any], normal: np.ndarray) -> None:
+        """Draw one side of the panel. White always: the next object's white would count as no change of a colour that differs in between."""
+        gl.glColor4f(1.0, 1.0, 1.0, 1.0)
         gl.glBegin(gl.GL_QUADS)
         gl.glNormal3f(*normal)
         for s, t, corner in corners:

@@ -21,7 +21,7 @@ _NEARER, _TURNED_RAD = 0.3, 0.12
 _CHANGED, _EDGE_PX = 4, 1.5
 _OVERLAP, _HIDDEN_OVERLAP, _SAME_DEPTH, _DEPTH_SHARE, _LEAST_PX = 0.8, 0.75, 0.03, 0.9, 150
 # A texture whose height is no power of two.
-_NAME, _TEXELS = "advnerf check", (48, 64)
+_NAME, _ANOTHER, _TEXELS = "advnerf check", "advnerf check, another", (48, 64)
 # Colours of the quarters: top left, top right, bottom left, bottom right.
 _QUARTERS = np.array([[225, 30, 30], [30, 200, 30], [30, 30, 225], [215, 205, 30]], dtype=np.uint8)
 _WRONG_WAYS = {
@@ -32,10 +32,13 @@ _WRONG_WAYS = {
 
 
 def panels_are_native(bench: WorldBench) -> str:
-    """A panel appears at its place, in its true size, the right way up and not mirrored, in depth too; the ground hides it; it can be removed."""
+    """A panel appears at its place, in its true size, the right way up and not mirrored, in depth too; the ground hides it; it can be removed.
+
+    One that was added before changes nothing of it.
+    """
     world = bench.world
     assert isinstance(world, NativePanels), "only asked where the world takes panels"
-    return _are_native(bench, lambda panel, rgb: world.add_panel(_NAME, panel, rgb))
+    return _are_native(bench, lambda name, panel, rgb: world.add_panel(name, panel, rgb))
 
 
 def meshes_are_native(bench: WorldBench) -> str:
@@ -43,7 +46,7 @@ def meshes_are_native(bench: WorldBench) -> str:
     world = bench.world
     assert isinstance(world, NativeMeshes), "only asked where the world takes meshes"
     found = _are_native(
-        bench, lambda panel, rgb: world.add_mesh(_NAME, None if rgb is None else sheet(panel, rgb))
+        bench, lambda name, panel, rgb: world.add_mesh(name, None if rgb is None else sheet(panel, rgb))
     )
     place = bench.places[0]
     before = world.observe_at(*place, depth=False)[0]
@@ -58,8 +61,8 @@ def meshes_are_native(bench: WorldBench) -> str:
     return found
 
 
-def _are_native(bench: WorldBench, put: Callable[[Panel, Rgb | None], None]) -> str:
-    """Check what ``put`` puts where a panel is asked for, or takes out where there is no texture."""
+def _are_native(bench: WorldBench, put: Callable[[str, Panel, Rgb | None], None]) -> str:
+    """Check what ``put`` puts where a panel is asked for by a name, or takes out where there is no texture."""
     world, place, half_lane_m = bench.world, bench.places[0], bench.description.off_track_m
     height_m = max(float(world.T_car_from_camera[2, 3]), 0.6 * _HIGH * half_lane_m)
     standing = _panel(bench, place, height_m)
@@ -67,25 +70,50 @@ def _are_native(bench: WorldBench, put: Callable[[Panel, Rgb | None], None]) -> 
     plain = [world.observe_at(*view) for view in views]
     overlaps = []
     try:
-        put(standing, _texture())
+        put(_NAME, standing, _texture())
         for view, (before, _) in zip(views, plain, strict=True):
             overlaps.append(_stands_there(bench, standing, view, before))
-        put(sunk := _panel(bench, place, 0.0), _texture())
+        put(_NAME, sunk := _panel(bench, place, 0.0), _texture())
         hidden = _is_hidden_by_the_ground(bench, sunk, place, plain[0][0])
     finally:
-        put(standing, None)
+        put(_NAME, standing, None)
     for view, (before, _) in zip(views, plain, strict=True):
         if not np.array_equal(world.observe_at(*view, depth=False)[0], before):
             raise NotMet("expected the scene as it was once a panel is taken out; got another picture")
     try:  # the last, as what else moves in the world has moved then
-        put(standing, _texture())
+        put(_NAME, standing, _texture())
+        _looks_the_same_after_another(bench, standing, place, put)
         _drives_on(bench, place)
     finally:
-        put(standing, None)
+        put(_NAME, standing, None)
     return (
         f"{100 * min(overlaps):.0f} % of its outline is where it should be, the right way round, at its depth; {100 * hidden:.0f} % where the ground hides "
         "its lower half"
     )
+
+
+def _looks_the_same_after_another(
+    bench: WorldBench, standing: Panel, view: Pose, put: Callable[[str, Panel, Rgb | None], None]
+) -> None:
+    """Check that what stands alone looks the same once another was put behind it before: the renderer's state may leak from one to the next."""
+    world, behind = bench.world, np.array(standing.T_world_from_face)
+    behind[:3, 3] -= standing.width_m * behind[:3, 0]
+    another = Panel(behind, standing.width_m, standing.height_m)
+    alone = world.observe_at(*view, depth=False)[0]
+    put(_NAME, standing, None)
+    put(_ANOTHER, another, _texture())
+    try:
+        put(_NAME, standing, _texture())
+        beside = world.observe_at(*view, depth=False)[0]
+    finally:
+        put(_ANOTHER, another, None)
+    on_it = _seen(bench, standing, view)[0]
+    apart = float(np.abs(beside[on_it].astype(np.float64).mean(axis=0) - alone[on_it].mean(axis=0)).max())
+    if apart > _CHANGED:
+        raise NotMet(
+            f"expected the same colours whether or not another one was added before; got them {apart:.0f} of 255 apart: does the renderer keep a colour, "
+            "light or texture of the other?"
+        )
 
 
 def sheet(panel: Panel, rgb: Rgb) -> Mesh:

@@ -90,6 +90,18 @@ class Stays(Changed):
             super().add_panel(name, panel, rgb)
 
 
+class KeepsTheColour(FlatWorld):
+    """Draws all but the first in the colour of the first one's back."""
+
+    def __init__(self, config: FlatConfig) -> None:
+        super().__init__(config)
+        self.names: list[str] = []
+
+    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
+        self.names = [each for each in self.names if each != name] + ([] if rgb is None else [name])
+        super().add_panel(name, panel, rgb if rgb is None or self.names[0] == name else rgb // 5)
+
+
 class OverThePicture(FlatWorld):
     """Draws the panel over what was rendered: depth does not know it, and nothing hides it."""
 
@@ -194,6 +206,7 @@ def test_what_is_no_mesh_is_refused() -> None:
         (LiesDown, "% of its outline is there"),
         (OneColour, "colours of the texture's quarters"),
         (Stays, "once a panel is taken out"),
+        (KeepsTheColour, "whether or not another one was added before; got them [0-9]+ of 255 apart"),
         (OverThePicture, "the panel's depth"),
         (NothingHidesIt, "not over the picture"),
         (TexturesFromBelow, "upside down"),
