@@ -22,7 +22,7 @@ from calibration.display_colour import (
 from calibration.schema import CalibrationError, load_calibration
 from hardware.worlds.paths import Pose
 from hardware.worlds.world import NativePanels, Panel, World
-from nodes.experiment.plan.placed import PlacedObject
+from nodes.experiment.plan.placed import PANEL, PlacedObject
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.placing import seen_from
 from nodes.runtime.errors import ConfigError
@@ -31,6 +31,8 @@ LIGHT = "panel_light.yaml"
 # Share of a panel's side that is measured, without its edge; number of poses, and least number of pixels.
 _INSIDE, _POSES, _LEAST_PX = 0.8, 3, 20
 _NAME = "light"
+# Shares of its own brightness between which a panel's light is no matter, and the grey that is looked at.
+_AS_BRIGHT, _GREY = (0.75, 1.33), 128
 # Without a room's glare on glass, black is black: primaries leave two channels dark.
 _LEAST_FREE = 0.4
 
@@ -75,6 +77,38 @@ def measure_light(experiment: Experiment, world: World) -> DisplayFit:
             f"{experiment.file}: carrier.response measured: expected light on the panel {thing.name} that does not depend on where the car is, and "
             f"a curve per channel that fits it, got: {found}; set carrier.response=identity"
         ) from error
+
+
+def light_remark(experiment: Experiment, world: World) -> str:
+    """A warning that names panels which the world lights otherwise than the learned scene, which shows their own colours; empty if there are none."""
+    looks = {
+        each.name: _brightness(experiment, world, each) for each in experiment.objects if each.kind == PANEL
+    }
+    dark, bright = _AS_BRIGHT
+    off = [f"{name} {share:.2f}" for name, share in looks.items() if share and not dark < share < bright]
+    if not off:
+        return ""
+    return (
+        f"warning: {experiment.file}: expected panels that this world shows as bright as their own colours, which the learned scene shows, got these "
+        f"times as bright: {', '.join(off)}; what is found there is weaker here: set carrier.response=measured (for one panel), or turn them to the light"
+    )
+
+
+def _brightness(experiment: Experiment, world: World, thing: PlacedObject) -> float:
+    """How bright a grey panel looks in the middle of the views of it, as a share of its grey; 0 if no drive sees it large enough."""
+    assert isinstance(world, NativePanels), "experiments are refused where their world takes no panels"
+    try:
+        poses = _poses(experiment, world, thing)
+    except ConfigError:
+        return 0.0
+    pose = poses[len(poses) // 2]
+    panel = Panel(thing.T_world_from_face, thing.side_m, thing.side_m)
+    try:
+        world.add_panel(_NAME, panel, np.full((2, 2, 3), _GREY, np.uint8))
+        picture = world.observe_at(*pose, depth=False)[0]
+    finally:
+        world.add_panel(_NAME, panel, None)
+    return float(mean_colour([picture], _region(experiment, thing, pose)).mean() * 255.0 / _GREY)
 
 
 def _poses(experiment: Experiment, world: World, thing: PlacedObject) -> list[Pose]:

@@ -19,7 +19,7 @@ from hardware.worlds.world import Photograph, Photographed, World
 from nodes.experiment.show.context import CALIBRATION, PLACED, Experiment
 from nodes.experiment.show.faces import DISPLAY, on_screen, panel_of, plain_screen, wanted_face
 from nodes.experiment.show.learned_scene import HELD_OUT
-from nodes.experiment.show.light import LIGHT, measure_light
+from nodes.experiment.show.light import LIGHT, light_remark, measure_light
 from nodes.experiment.show.placing import place_by_rule
 from nodes.experiment.show.screen import measure_display, screens_of
 from nodes.runtime.progress import Report, counted
@@ -44,6 +44,8 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         if experiment.config.carrier.response == "measured":
             report(0.0, "measuring the light on the panel")
             save_calibration(measure_light(experiment, scene).calibration(), folder / CALIBRATION / LIGHT)
+        elif experiment.config.carrier.kind == "native" and (said := light_remark(experiment, scene)):
+            print(said, flush=True)
         _calibrate(experiment, scene, folder / CALIBRATION, report)
         poses = scene.photo_poses(config.photos, rng)
         write_posed_images(

@@ -15,7 +15,7 @@ from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.world import shading
 from nodes.experiment.show.deployed import DressedScene
-from nodes.experiment.show.light import measure_light
+from nodes.experiment.show.light import light_remark, measure_light
 from nodes.experiment.show.native import NativeScene
 from nodes.experiment.show.objects import placed_objects
 from nodes.experiment.steps.pipeline import stages_of
@@ -137,3 +137,23 @@ def test_light_that_depends_on_where_the_car_is_is_refused_in_words_for_a_world(
         ConfigError, match=r"does not depend on where the car is.*set carrier\.response=identity$"
     ):
         measure_light(experiment, world)
+
+
+def test_a_panel_that_the_world_shows_darker_than_the_learned_scene_is_told(
+    measured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was found in its own colours did next to nothing in Duckietown, where panels are 0.56 times as bright."""
+    experiment, world, _ = measured
+    assert light_remark(experiment, world) == ""
+    seen, factor = world.observe_at, shading(experiment.objects[0].T_world_from_face[:3, 0])
+
+    def at_dusk(x_m: float, y_m: float, yaw_rad: float, depth: bool = True):
+        rgb, found = seen(x_m, y_m, yaw_rad, depth)
+        return (rgb * 0.5).astype(np.uint8), found
+
+    monkeypatch.setattr(world, "observe_at", at_dusk)
+    told = light_remark(experiment, world)
+    assert f"times as bright: board {0.5 * factor:.1f}" in told
+    assert "set carrier.response=measured (for one panel)" in told
+    monkeypatch.undo()
+    assert light_remark(experiment, world) == "", "the panel was taken away, and is put there again"
