@@ -184,7 +184,11 @@ class AttackNode(Node):
         self._job = Job(self._folder / request_id, self.inbox, self._config.threads)
 
     def _cancel(self, message: Any) -> None:
-        if self._job is not None and str(message.request_id) in ("", self._request_id):
+        if (wanted := str(message.request_id)) not in ("", self._request_id):
+            raise AdvnerfError(
+                f"expected the id of the present request, {self._request_id or 'of which there is none'}, got {wanted}; nothing was cancelled"
+            )
+        if self._job is not None:
             self._keep("cancelled")
             self._finish("cancelled", str(message.reason))
 

@@ -55,7 +55,9 @@ def attack_cancel(
     from nodes.experiment.node.client import cancel_attack
     from nodes.launching.watching import find_run_dir
 
-    print(in_words(cancel_attack(find_run_dir(run_dir), request_id, reason)))
+    last = cancel_attack(find_run_dir(run_dir), request_id, reason)
+    print(in_words(last))
+    fail_unless(last.state != "refused")
 
 
 def in_words(progress: Any) -> str:
