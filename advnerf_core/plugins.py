@@ -187,7 +187,7 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
         sys.modules[name] = module  # dataclasses look their module up while it is being loaded
         try:
             # Not by the loader: its byte code cache compares times to the second, and a file may be saved twice in one.
-            with _imports_from(file.parent, modules_beside(file)):
+            with _imports_from(file.parent, modules_beside(file)), torch_left_as_it_is():
                 exec(compile(file.read_bytes(), file, "exec"), module.__dict__)
         except FAILURES as error:
             del sys.modules[name]
@@ -307,7 +307,8 @@ def unknown(name: str, what: str, known: Iterable[str]) -> str:
 
 def _load_entry_point(entry: EntryPoint, what: str) -> Any:
     try:
-        return entry.load()
+        with torch_left_as_it_is():
+            return entry.load()
     except FAILURES as error:
         package = entry.dist.name if entry.dist is not None else "an installed package"
         raise PluginError(
@@ -335,9 +336,44 @@ def exit_refused() -> Iterator[None]:
         raise PluginError(EXITED) from asked
 
 
-def in_one_line(error: BaseException) -> str:
-    """Type and text of an error, without line breaks; of one that a user's code has raised also the file and line."""
-    text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+@contextmanager
+def torch_left_as_it_is() -> Iterator[None]:
+    """Refuse a user's code that changes torch for all code after it: the default dtype or device, or whether gradients are recorded.
+
+    Raises:
+        PluginError: The code inside has changed one of them; they are set back.
+    """
+    before = _settings_of_torch()
+    try:
+        yield
+    finally:
+        after = _settings_of_torch()
+        if after != before:
+            torch = sys.modules["torch"]
+            torch.set_default_dtype(getattr(torch, before["default dtype"].removeprefix("torch.")))
+            torch.set_default_device(None if before["default device"] == "cpu" else before["default device"])
+            torch.set_grad_enabled(before["recording of gradients"] == "on")
+    for name, value in before.items():
+        if after[name] != value:
+            raise PluginError(
+                f"expected torch's {name} as it was, {value}, got {after[name]}, which all other code would have too; set it for tensors or blocks of your "
+                "own (dtype=..., device=..., with torch.no_grad()), or set it back"
+            )
+
+
+def _settings_of_torch() -> dict[str, str]:
+    if (torch := sys.modules.get("torch")) is None:
+        return {"default dtype": "torch.float32", "default device": "cpu", "recording of gradients": "on"}
+    return {
+        "default dtype": str(torch.get_default_dtype()),
+        "default device": str(torch.get_default_device()),
+        "recording of gradients": "on" if torch.is_grad_enabled() else "off",
+    }
+
+
+def in_one_line(error: BaseException, longest: int | None = None) -> str:
+    """Type and text of an error, without line breaks, cut after ``longest`` characters; of one that a user's code has raised also the file and line."""
+    text = f"{type(error).__name__}: {' '.join(str(error).split())[:longest]}"
     where = "" if isinstance(error, AdvnerfError) else line_of_a_user(error)
     return f"{text} ({where})" if where else text
 

@@ -18,7 +18,7 @@ from weakref import WeakKeyDictionary
 
 from advnerf_core.code_files import module_sha256
 from advnerf_core.inputs import InputFiles
-from advnerf_core.plugins import FAILURES, in_one_line
+from advnerf_core.plugins import FAILURES, in_one_line, torch_left_as_it_is
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.declaration import DECLARATION_SUFFIX
 from advnerf_core.policies.driver import Driver
@@ -158,7 +158,8 @@ def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
     module_name, _, name = spec.partition(":")
     search_working_folder_last()
     try:
-        module, code = _imported(module_name)
+        with torch_left_as_it_is():
+            module, code = _imported(module_name)
         factory = getattr(module, name)
     except (ImportError, AttributeError) as error:
         raise PolicyContractError(
@@ -167,7 +168,8 @@ def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
     except FAILURES as error:
         raise PolicyContractError(f"{spec}: {module_name} cannot be loaded: {in_one_line(error)}") from error
     try:
-        policy = factory()
+        with torch_left_as_it_is():
+            policy = factory()
     except FAILURES as error:
         if isinstance(error, PolicyContractError):
             raise

@@ -8,6 +8,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from advnerf_core.plugins import FAILURES, in_one_line, is_signal
+
 T = TypeVar("T")
 
 
@@ -56,9 +58,10 @@ def look(
         return CheckFinding(name, "met, but look", str(reason))
     except lets_through:
         raise
-    except Exception as error:  # a plug-in may raise anything
-        text = f"raised {type(error).__name__}: {' '.join(str(error).split()):.200}"
-        return CheckFinding(name, "not met", text)
+    except FAILURES as error:  # a plug-in may raise anything
+        if isinstance(error, SystemExit) and is_signal(error.code):
+            raise
+        return CheckFinding(name, "not met", f"raised {in_one_line(error, 200)}")
 
 
 def look_at_all(checks: Mapping[str, Callable[[T], str]], bench: T) -> list[CheckFinding]:

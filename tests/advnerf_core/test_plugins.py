@@ -104,6 +104,16 @@ def test_a_file_is_loaded_from_its_folder_and_again_when_it_changes(tmp_path: Pa
         ("raise SystemExit(0)\n", "mine.py:Mine", "cannot be loaded: SystemExit: 0"),
         ("x = 1 / 0\n", "mine.py:Mine", "cannot be loaded: ZeroDivisionError: division by zero"),
         (
+            "import torch\ntorch.set_default_dtype(torch.float64)\nMine = 1\n",
+            "mine.py:Mine",
+            r"cannot be loaded: PluginError: expected torch's default dtype as it was, torch.float32, got torch.float64",
+        ),
+        (
+            "import torch\ntorch.set_grad_enabled(False)\nMine = 1\n",
+            "mine.py:Mine",
+            r"recording of gradients as it was, on, got off.*with torch.no_grad",
+        ),
+        (
             "Mime = 1\n",
             "mine.py:Mine",
             r"expected a name in mine.py of Mime; got 'Mine' \(did you mean Mime\?\)",
