@@ -16,15 +16,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
+from advnerf_core.attack.methods import Method, MethodError, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem, BlackBoxError
 from advnerf_core.attack.search.record import Evaluation, SearchResult
 from advnerf_core.attack.search.search import SearchStateError
+from advnerf_core.attack.spaces.space import require_driven
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Line
 from advnerf_core.driving.path import Path as Reference
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform
+from advnerf_core.plugins import torch_left_as_it_is
 from advnerf_core.scene.surrogate import Surrogate
 from nodes.runtime.findings import CheckFinding, NotMet, look_at_all
 
@@ -112,10 +114,12 @@ class MethodBench:
                 raise _Stopped
 
         run = SearchRun(seed, self.folder / state if state else None, tell, settings_hash)
-        found: object = self.method.search(problem or _problem(), self.settings, run)
-        if not isinstance(found, SearchResult):
+        with torch_left_as_it_is():
+            found: object = self.method.search(problem or _problem(), self.settings, run)
+        if not isinstance(found, SearchResult) or not isinstance(found.theta, Tensor):
+            got = getattr(found, "theta", found)
             raise NotMet(
-                f"expected search to return a SearchResult, got {type(found).__name__}; return the state's result()"
+                f"expected search to return a SearchResult with a tensor theta, got {type(got).__name__}; return the state's result()"
             )
         return found, told
 
@@ -136,11 +140,17 @@ def keeps_to_its_budget(bench: MethodBench) -> str:
         )
     if [each.iteration for each in result.history] != list(range(count)):
         raise NotMet("expected evaluations numbered from 0 in their order")
+    allowed = _EVALUATIONS * _STEPS * len(problem.start_states)
+    if problem.policy.asked > allowed and not bench.method.needs_gradient:
+        raise NotMet(
+            f"expected at most {allowed} images that the policy is asked about, those of {_EVALUATIONS} drives, got {problem.policy.asked}; drives beside "
+            "the counted ones are of the same budget"
+        )
     return f"{count} evaluations of {_EVALUATIONS}; the policy was asked about {problem.policy.asked} images"
 
 
 def returns_its_best(bench: MethodBench) -> str:
-    """Theta has the sensor's shape and is finite, and the best evaluation is the largest of the history."""
+    """Theta has the sensor's shape and is finite, and gives the best evaluation, which is the largest of the history."""
     result, _ = bench.search()
     shape = tuple(_problem().sensor.theta_shape)
     if tuple(result.theta.shape) != shape or not bool(torch.isfinite(result.theta).all()):
@@ -150,6 +160,10 @@ def returns_its_best(bench: MethodBench) -> str:
         raise NotMet(
             f"expected the best evaluation, {largest:.3f} m, got one of {result.best.predicted_total_cte_m:.3f} m"
         )
+    try:
+        require_driven(_problem(), result, within=1e-6)
+    except MethodError as error:
+        raise NotMet(str(error)) from None
     return f"theta {list(shape)}, best {largest:.3f} m"
 
 

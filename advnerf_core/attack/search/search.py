@@ -66,7 +66,8 @@ class SearchState:
         )
         self.history.append(evaluation)
         if self.best is evaluation:
-            self.best_theta = theta.detach().clone()
+            # Files keep no strides, such as those of a transposed theta.
+            self.best_theta = theta.detach().clone(memory_format=torch.contiguous_format)
         return evaluation
 
     def result(self) -> SearchResult:

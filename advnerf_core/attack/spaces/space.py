@@ -6,6 +6,7 @@ file, put into a deployment, or driven past in the learned scene.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -14,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.artifact import (
     COLOURS,
     MESH_SHAPE,
@@ -24,7 +26,7 @@ from advnerf_core.attack.artifact import (
     AttackFileError,
     face_texture,
 )
-from advnerf_core.attack.methods import Method, MethodError, SearchRun, SearchSettings, load_method
+from advnerf_core.attack.methods import METHODS, Method, MethodError, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem, Sensor
 from advnerf_core.attack.search.record import SearchResult
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
@@ -36,6 +38,7 @@ from advnerf_core.geometry import Array
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.glb import glb_bytes
 from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
+from advnerf_core.plugins import PluginError, torch_left_as_it_is
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 
 
@@ -152,19 +155,53 @@ def searched(
 ) -> SearchResult:
     """The result of a method's search, which spent no more than the budget: methods are compared by what they find with the same one.
 
+    What a user's method returns is driven once more, on a problem that the method could not change.
+
     Raises:
-        MethodError: It spent more, or returns something else.
+        MethodError: It spent more, or returns something else, or its theta does not give its best evaluation.
     """
-    found: object = method.search(problem, settings, run)
-    wanted, got = "a SearchResult", type(found).__name__
-    if isinstance(found, SearchResult):
+    if name in METHODS:
+        return _in_form(method.search(problem, settings, run), problem, settings)
+    own = replace(problem, start_states=problem.start_states.clone())
+    try:
+        with torch_left_as_it_is():
+            returned = method.search(own, settings, run)
+        found = _in_form(returned, problem, settings)
+        require_driven(problem, found)
+    except (MethodError, PluginError) as error:
+        raise MethodError(f"attack method {name}: {error}") from None
+    return found
+
+
+def require_driven(problem: AttackProblem, found: SearchResult, within: float = 0.02) -> None:
+    """Raise unless a drive past the theta of a result is its best evaluation. Disturbances are drawn for each drive: then nothing is compared.
+
+    Args:
+        within: Share by which the values may differ: a method may round its theta, and drives amplify that.
+
+    Raises:
+        MethodError: The drive gives another value.
+    """
+    if problem.disturbances is not None:
+        return
+    value = float(evaluate(problem, found.theta)[1].values.mean())
+    if not math.isclose(value, found.best.value, rel_tol=within, abs_tol=1e-6):
+        raise MethodError(
+            f"expected theta to be that of the best evaluation, {found.best.value:.6g}, got one whose drive gives {value:.6g}; return the state's result(), "
+            "evaluate by evaluate_theta, and leave the problem as it is"
+        )
+
+
+def _in_form(found: object, problem: AttackProblem, settings: SearchSettings) -> SearchResult:
+    wanted, got = "a SearchResult with a tensor theta", type(found).__name__
+    if isinstance(found, SearchResult) and isinstance(found.theta, Tensor):
         shape, count = tuple(problem.sensor.theta_shape), len(found.history)
         if tuple(found.theta.shape) == shape and 1 <= count <= settings.evaluations:
             return found
         wanted = f"theta {list(shape)} after 1 to {settings.evaluations} evaluations, which are the budget of every method"
         got = f"{list(found.theta.shape)} after {count}"
     raise MethodError(
-        f"attack method {name}: expected {wanted}, got {got}; correct it: 'advnerf attack method check' looks at all that a method must keep"
+        f"expected {wanted}, got {got}; correct it: 'advnerf attack method check' looks at all that a method must keep"
     )
 
 

@@ -57,7 +57,10 @@ def test_a_method_of_a_file_runs_a_request_and_resumes_to_the_same_bytes(tmp_pat
     ("before", "after", "says"),
     [
         ("< settings.evaluations:", "< 2 * settings.evaluations:", r"after 1 to 3 evaluations, .*, got \[8, 8, 3\] after 6"),
-        ("return state.result()", "return state.result().theta", "expected a SearchResult, got Tensor"),
+        ("return state.result()", "return state.result().theta", "expected a SearchResult with a tensor theta, got Tensor"),
+        ("return state.result()", "r = state.result(); return type(r)(r.theta, type(r.best)(**{**vars(r.best), 'values': (9.0,)}), r.history)", "attack method .*Spiral: expected theta to be that of the best evaluation"),
+        ("    state = begin", "    problem.start_states.add_(0.3)\n    state = begin", "leave the problem as it is"),
+        ("return state.result()", "torch.set_grad_enabled(False); return state.result()", "recording of gradients as it was, on, got off"),
         ("< settings.evaluations:", "< 0:", "expected at least one evaluation before the result"),
     ],
 )  # fmt: skip
