@@ -22,6 +22,7 @@ from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
 from advnerf_core.driving.path import Path
 from advnerf_core.driving.solids import Solids
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.plugins import exit_refused, torch_left_as_it_is
 
 # A path that turns by less over a drive has no outside [rad].
 _LEAST_TURN_RAD = 0.2
@@ -300,8 +301,11 @@ def losses_of(objective: Objective, drives: JudgedDrives) -> Tensor:
     Raises:
         ObjectiveError: The objective does not give one finite number for each drive.
     """
+    # Whole numbers and booleans have no mean, and no gradient that could be looked for.
+    if type(objective).loss is Objective.loss:
+        found = _judged(objective, "value", drives)
+        return -(found if found.is_floating_point() else found.to(drives.states.dtype))
     found = _judged(objective, "loss", drives)
-    # Whole numbers have no mean, and no gradient that could be looked for.
     return found if found.is_floating_point() else found.to(drives.states.dtype)
 
 
@@ -326,20 +330,46 @@ def loss_slopes(objective: Objective, drives: JudgedDrives) -> tuple[float, Tens
 def _judged(objective: Objective, what: Literal["value", "loss"], drives: JudgedDrives) -> Tensor:
     seen = {"states": drives.states, "cte_m": drives.cte_m}
     before = {name: each.detach().clone() for name, each in seen.items()}
-    found = _one_each(objective, what, getattr(objective, what)(drives), drives)
+    found = _one_each(objective, what, _called(objective, what, drives), drives)
     for name, each in seen.items():
         if not torch.allclose(each.detach(), before[name], rtol=0.0, atol=0.0, equal_nan=True):
             raise ObjectiveError(
                 f"expected {what} of {type(objective).__name__} to leave drives.{name} as it is, got other numbers in it after the call, which would be "
                 "taken for the car's drive; write x = x - y instead of x -= y, and clamp instead of clamp_"
             )
+    if type(objective).__module__ != __name__:
+        _require_judged_alone(objective, what, drives, found)
     return found
+
+
+def _called(objective: Objective, what: Literal["value", "loss"], drives: JudgedDrives) -> object:
+    with torch_left_as_it_is(), exit_refused():
+        return getattr(objective, what)(drives)
+
+
+def _require_judged_alone(
+    objective: Objective, what: Literal["value", "loss"], drives: JudgedDrives, found: Tensor
+) -> None:
+    first = replace(drives, states=drives.states[:, :1].detach())
+    with torch.no_grad():
+        alone = _one_each(objective, what, _called(objective, what, first), first)
+    one, other = float(found[0].detach()), float(alone[0])
+    # Sums over a batch are rounded in another order.
+    if not math.isclose(one, other, rel_tol=1e-3, abs_tol=1e-6):
+        raise ObjectiveError(
+            f"expected {what} of {type(objective).__name__} to judge each drive by that drive alone, and the same each time, got {one:.6g} for the first of "
+            f"{len(found)} and {other:.6g} for it alone; sum over the ticks, dimension 0, draw no random numbers, and keep nothing between calls"
+        )
 
 
 def _one_each(objective: Objective, what: str, found: object, drives: JudgedDrives) -> Tensor:
     count = drives.states.shape[1]
-    if not isinstance(found, Tensor) or tuple(found.shape) != (count,):
-        got = f"shape {list(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
+    if not isinstance(found, Tensor) or tuple(found.shape) != (count,) or found.is_complex():
+        got = (
+            f"{found.dtype} of shape {list(found.shape)}"
+            if isinstance(found, Tensor)
+            else type(found).__name__
+        )
         raise ObjectiveError(
             f"expected {what} of {type(objective).__name__} to return a tensor [{count}], one number for each drive, got {got}"
         )

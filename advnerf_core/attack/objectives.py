@@ -62,6 +62,8 @@ def load_objective(reference: str, folder: Path | None = None) -> Objective:
         )
     if found.value is base.value:
         raise PluginError(f"{_WHAT} {reference}: expected a class with a method value, got none; define it")
+    if not isinstance(found.unit, str):
+        raise PluginError(f"{_WHAT} {reference}: expected a unit such as 'm' or 's', got {found.unit!r}")
     try:
         return found()
     except TypeError as error:

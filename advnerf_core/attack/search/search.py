@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -249,7 +250,9 @@ def evaluation_from_json(entry: dict[str, Any]) -> Evaluation:
 def search_fingerprint(problem: AttackProblem, theta_shape: tuple[int, ...], **settings: Any) -> str:
     """Hash of everything that must be the same when a search is resumed (its length may differ)."""
     if problem.objective != CrossTrackError():
-        settings["objective"] = type(problem.objective).__qualname__, repr(vars(problem.objective))
+        # Addresses of what a user's objective keeps differ in the process that goes on.
+        kept = re.sub(r" at 0x[0-9a-fA-F]+", "", repr(vars(problem.objective)))
+        settings["objective"] = type(problem.objective).__qualname__, kept
     text = json.dumps({"steps": problem.steps, "theta_shape": list(theta_shape), **settings}, sort_keys=True)
     digest = hashlib.sha256(text.encode())
     if problem.disturbances is not None:

@@ -238,12 +238,14 @@ def test_names_stand_for_objectives_and_wrong_ones_are_one_line(tmp_path):
         LEFT
         + "\nclass Bare(Objective):\n    pass\n\nclass Needy(Objective):\n    def __init__(self, side):\n        pass\n"
         "    def value(self, drives):\n        return drives.cte_m.sum(0)\n\nclass peak(Left):\n    pass\n\nclass Loose:\n    pass\n"
+        "\nclass Unitless(Left):\n    unit = 1000\n"
     )
     wrong = {
         "pek": r"expected an objective of cte, run_wide, drift_left, drift_right, peak, time_off_track, collision; got 'pek' .did you mean peak",
         "mine.py:Loose": "expected a class that derives from Objective",
         "mine.py:Bare": "expected a class with a method value",
         "mine.py:Needy": "expected a class that is made without arguments",
+        "mine.py:Unitless": "expected a unit such as 'm' or 's', got 1000",
         "mine.py:peak": "expected a name that no built-in objective has",
         "none.py:Left": "expected a Python file",
     }
@@ -298,6 +300,61 @@ def test_an_objective_that_changes_the_drives_in_place_is_refused(objective, nam
         judged(objective, random_drives(3))
 
 
+class OfAll(Objective):
+    def value(self, drives):
+        return drives.cte_m.abs().sum().expand(drives.cte_m.shape[1])
+
+
+class AboutTheMean(Objective):
+    def value(self, drives):
+        return drives.cte_m.abs().sum(0)
+
+    def loss(self, drives):
+        errors = drives.cte_m.abs()
+        return (errors.mean() - errors).sum(0)
+
+
+class DrawsLots(Objective):
+    def value(self, drives):
+        return drives.cte_m.sum(0) + torch.rand(1)
+
+
+class CountsItsCalls(Objective):
+    calls = 0
+
+    def value(self, drives):
+        self.calls += 1
+        return drives.cte_m.sum(0) + self.calls
+
+
+@pytest.mark.parametrize("objective", [OfAll(), AboutTheMean(), DrawsLots(), CountsItsCalls()])
+def test_an_objective_that_does_not_judge_each_drive_alone_is_refused(objective):
+    """A search keeps the theta of the highest value: of lots and counts that is any, and a batch of seeds would share one."""
+    with pytest.raises(
+        ObjectiveError, match=r"to judge each drive by that drive alone, and the same each time"
+    ):
+        losses_of(objective, random_drives(3))
+
+
+def test_an_objective_of_one_drive_that_draws_lots_is_refused():
+    with pytest.raises(ObjectiveError, match=r"for the first of 1 and .* for it alone"):
+        values_of(DrawsLots(), random_drives(1))
+
+
+def test_what_an_objective_keeps_has_no_address_in_a_state(tmp_path):
+    class Keeps(CountsItsCalls):
+        def __init__(self):
+            self.lock = object()
+
+        def value(self, drives):
+            return drives.cte_m.sum(0)
+
+    run = SearchRun(state_path=tmp_path / "state.safetensors")
+    METHODS["random"].search(in_the_room(Keeps(), 2), SearchSettings(1), run)
+    resumed = METHODS["random"].search(in_the_room(Keeps(), 2), SearchSettings(2), run)
+    assert len(resumed.history) == 2
+
+
 def test_what_breaks_the_contract_is_one_line():
     class Constant(Objective):
         def value(self, drives):
@@ -311,6 +368,18 @@ def test_what_breaks_the_contract_is_one_line():
         def value(self, drives):
             return (-1.0 - drives.cte_m.abs().sum(0)).sqrt()
 
+    class Any(Objective):
+        def value(self, drives):
+            return (drives.cte_m.abs() > 0.1).any(0)
+
+    class Complex(Objective):
+        def value(self, drives):
+            return torch.complex(drives.cte_m.sum(0), drives.cte_m.sum(0))
+
+    class Exits(Objective):
+        def value(self, drives):
+            raise SystemExit
+
     class Whole(Objective):
         def value(self, drives):
             return drives.cte_m.abs().sum()
@@ -321,12 +390,19 @@ def test_what_breaks_the_contract_is_one_line():
         loss_slopes(Constant(), drives)
     with pytest.raises(ObjectiveError, match=r"loss of Counts that is differentiable"):
         loss_slopes(Counts(), drives)
+    assert losses_of(Any(), drives).tolist() == [-float(each) for each in values_of(Any(), drives)]
+    with pytest.raises(PluginError, match=r"it has called sys\.exit"):
+        values_of(Exits(), drives)
     for judged in (values_of, losses_of):
+        with pytest.raises(ObjectiveError, match=r"value of Complex to return a tensor .*complex"):
+            judged(Complex(), drives)
         with pytest.raises(
-            ObjectiveError, match=r"finite (value|loss) of Root for each drive, got \[nan, nan, nan\]"
+            ObjectiveError, match=r"finite value of Root for each drive, got \[nan, nan, nan\]"
         ):
             judged(Root(), drives)
-    with pytest.raises(ObjectiveError, match=r"value of Whole to return a tensor \[3\].*got shape \[\]"):
+    with pytest.raises(
+        ObjectiveError, match=r"value of Whole to return a tensor \[3\].*got torch.float64 of shape \[\]"
+    ):
         values_of(Whole(), drives)
     with pytest.raises(ObjectiveError, match=r"expected a place with solids for the objective Collision"):
         toy_problem(2, objective=Collision())
