@@ -99,6 +99,11 @@ def find_camera(name: str, folder: Path | None = None) -> Any:
         raise PluginError(
             f"camera {name}: expected an attribute Config with its keys, a pydantic model or a dataclass (empty if it has none), got none; see {_PAGE}"
         )
+    missing = [name for name in ("open", "read", "close") if getattr(found, name) is getattr(Camera, name)]
+    if missing:
+        raise PluginError(
+            f"camera {name}: expected a class that defines open, read and close, got none of {', '.join(missing)}; see {_PAGE}"
+        )
     try:
         inspect.signature(found).bind(None)
     except TypeError as error:

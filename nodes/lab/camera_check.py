@@ -9,13 +9,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hardware.cameras.interface import Camera, Frame
 from hardware.cameras.steady import SteadyCamera
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost
-from nodes.runtime.findings import CheckFinding, NotMet, form_of, look
+from nodes.runtime.findings import CheckFinding, MetButLook, NotMet, form_of, look
 from nodes.runtime.inbox import Inbox, ReaderThread
 
 _FRAMES = 4
@@ -31,6 +33,7 @@ _WAITING, _PAUSE_S, _AT_ONCE = 8, 3.0, 2.5
 # A part opens a device several times, and waits for a few frames of it.
 _MOST_S = 120.0
 _OLDEST_NS, _CLOCKS_NS = 1_000_000_000, 20_000_000
+_DROPPED_NS = 200_000_000  # default of the camera node's max_age_s
 COLOURS = ("red", "green", "blue")
 Read = Callable[[float], Frame | None]
 
@@ -114,22 +117,36 @@ def _refuses_to_read(camera: Camera, when: str) -> None:
 
 
 def frames_have_their_form(bench: CameraBench) -> str:
-    """Images are ``[H, W, 3]`` uint8, contiguous and read-only, and all of one size."""
+    """Images are ``[H, W, 3]`` uint8, contiguous, read-only and not written into again, and all of one size; a sensor's differ."""
+    frames: list[Frame] = []
+    copies: list[NDArray[Any]] = []
     with bench.opened():
-        frames = [bench.frame() for _ in range(_FRAMES)]
+        for _ in range(_FRAMES):
+            frames.append(bench.frame())
+            copies.append(np.array(frames[-1].rgb))
     for frame in frames:
         rgb = frame.rgb
-        if not isinstance(rgb, np.ndarray) or rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+        formed = isinstance(rgb, np.ndarray) and rgb.ndim == 3 and rgb.shape[2] == 3 and rgb.dtype == np.uint8
+        if not formed or not rgb.size:
             raise NotMet(f"expected rgb [H, W, 3] uint8, got {form_of(rgb)}; convert the image")
         if not rgb.flags.c_contiguous:
             raise NotMet("expected contiguous pixels, got a view; use numpy.ascontiguousarray")
         if rgb.flags.writeable:
             raise NotMet("expected read-only pixels; set rgb.flags.writeable = False")
+    if any(not np.array_equal(frame.rgb, copy) for frame, copy in zip(frames, copies, strict=True)):
+        raise NotMet(
+            "expected pixels that stay, got a frame that a later read() has written into: each node would see half of two pictures; return a copy"
+        )
     sizes = {frame.rgb.shape for frame in frames}
     if len(sizes) > 1:
         raise NotMet(f"expected images of one size, got {sorted(sizes)}")
     height, width, _ = frames[0].rgb.shape
-    return f"{width} x {height}, uint8 RGB, read-only"
+    found = f"{width} x {height}, uint8 RGB, read-only"
+    if all(np.array_equal(frames[0].rgb, frame.rgb) for frame in frames) and not frames[0].simulated:
+        raise MetButLook(
+            f"{found}; {_FRAMES} identical pictures: a sensor's noise makes them differ, so the camera node withholds repeated ones (repeats: 0 ends that)"
+        )
+    return found
 
 
 def stamps_rise(bench: CameraBench) -> str:
@@ -137,6 +154,12 @@ def stamps_rise(bench: CameraBench) -> str:
     with bench.opened():
         frames = [bench.frame() for _ in range(_FRAMES)]
     real_ns, mono_ns = time.time_ns(), time.monotonic_ns()
+    for frame in frames:
+        for name in ("stamp_mono_ns", "stamp_realtime_ns", "sequence"):
+            if not isinstance(value := getattr(frame, name), int | np.integer):
+                raise NotMet(
+                    f"expected a whole number for {name}, got {value!r}; use time.time_ns and time.monotonic_ns"
+                )
     for before, after in itertools.pairwise(frames):
         for name in ("stamp_mono_ns", "stamp_realtime_ns", "sequence"):
             if not getattr(after, name) > getattr(before, name):
@@ -154,7 +177,12 @@ def stamps_rise(bench: CameraBench) -> str:
     if not 0 <= age_ns < _OLDEST_NS:
         raise NotMet(f"expected a stamp of the last second, got one {age_ns / 1e9:.3f} s ago")
     rate_hz = (_FRAMES - 1) * 1e9 / (frames[-1].stamp_mono_ns - frames[0].stamp_mono_ns)
-    return f"rise on both clocks; age {age_ns / 1e6:.1f} ms, {rate_hz:.1f} Hz over {_FRAMES} frames"
+    found = f"rise on both clocks; age {age_ns / 1e6:.1f} ms, {rate_hz:.1f} Hz over {_FRAMES} frames"
+    if age_ns > _DROPPED_NS:
+        raise MetButLook(
+            f"{found}; the camera node drops frames older than its max_age_s, {_DROPPED_NS / 1e9:g} s if it is not set"
+        )
+    return found
 
 
 def opens_twice(bench: CameraBench) -> str:

@@ -9,6 +9,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
+from advnerf_core.plugins import exit_refused
+
 T = TypeVar("T")
 _MOST_URGENT = 1000
 
@@ -108,7 +110,9 @@ class ReaderThread(Generic[T]):
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                item = self._read()
+                # A thread that calls sys.exit ends without a word.
+                with exit_refused():
+                    item = self._read()
                 if item is not None:
                     self._inbox.put(item)
         except Exception as failure:  # raised again in the node's loop

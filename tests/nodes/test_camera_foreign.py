@@ -27,7 +27,7 @@ from nodes.launching.launch_file import load_launch
 from nodes.runtime import decode
 from nodes.runtime.config import load_node_config
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.findings import NotMet
+from nodes.runtime.findings import MetButLook, NotMet
 from nodes.runtime.pictures import rgb_image
 
 ROOT = Path(__file__).parents[2]
@@ -77,6 +77,10 @@ class Generator(Camera):
 
 class Bare(Camera):
     pass
+
+
+class Mute(Generator):
+    read = Camera.read
 
 
 class Other(Generator):
@@ -171,6 +175,7 @@ def test_a_wrong_key_is_one_line(generator: Path, keys: str, message: str) -> No
             "mine.py:Frame",
             r"expected a class that derives from hardware\.cameras\.interface\.Camera, got the class Frame",
         ),
+        ("mine.py:Mute", "expected a class that defines open, read and close, got none of read"),
         ("mine.py:Bare", "expected an attribute Config with its keys, .* got none"),
         (
             "mine.py:Other",
@@ -213,6 +218,9 @@ def test_the_check_meets_a_good_camera_and_says_what_it_executes(generator: Path
         ("frames", "rgb.flags.writeable = False", "pass", "read-only"),
         ("frames", "np.uint8)", "float)", r"\[H, W, 3\] uint8, got float64"),
         ("stamps", "time.time_ns()", "1", "both stamps|stamp_realtime_ns to rise"),
+        ("frames", "(4, self.config.width, 3)", "(0, self.config.width, 3)", r"\[H, W, 3\] uint8, got uint8 \[0, 6, 3\]"),
+        ("frames", "rgb = np.full(", "self.kept = kept = getattr(self, 'kept', np.zeros((4, 6, 3), np.uint8)); kept[:] = self.number; rgb = kept.view(); (", "a later read.. has written into"),
+        ("stamps", "time.time_ns(), time.monotonic_ns()", "1e9 * time.time(), 1e9 * time.monotonic()", "a whole number for stamp_mono_ns, got .*; use time.time_ns"),
         ("stamps", "self.number)", "7)", "sequence to rise"),
         ("closed", 'raise LinkLost("expected an open camera; call open() first")', "return None", "LinkLost"),
         ("stall", "wait_s > timeout_s", "False", "return None while there is no new frame"),
@@ -229,6 +237,23 @@ def test_the_check_finds_what_is_wrong(
     generator.write_text(GENERATOR.replace(before, after))
     camera = parse_source(f"{{kind: {generator}:Generator, width: 6}}").camera()
     with pytest.raises(NotMet, match=message):
+        CHECKS[part](CameraBench(camera))
+
+
+@pytest.mark.parametrize(
+    ("part", "before", "after", "message"),
+    [
+        ("frames", "self.number % 256, np", "7, np", "4 identical pictures: .*repeats: 0 ends that"),
+        ("stamps", "time.time_ns(), time.monotonic_ns()", "time.time_ns() - 10**9 // 2, time.monotonic_ns() - 10**9 // 2", "drops frames older than its max_age_s, 0.2 s"),
+    ],
+)  # fmt: skip
+def test_the_check_shows_what_the_node_would_not_publish(
+    generator: Path, part: str, before: str, after: str, message: str
+) -> None:
+    assert before in GENERATOR
+    generator.write_text(GENERATOR.replace(before, after))
+    camera = parse_source(f"{{kind: {generator}:Generator, width: 6}}").camera()
+    with pytest.raises(MetButLook, match=message):
         CHECKS[part](CameraBench(camera))
 
 

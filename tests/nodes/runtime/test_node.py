@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 
+from advnerf_core.plugins import PluginError
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import NodeFinished
 from nodes.runtime.loop import Schedule
@@ -61,6 +62,16 @@ def test_reader_thread_brings_items_and_failures():
     thread.start()
     thread._thread.join(60)
     with pytest.raises(OSError, match="unplugged"):
+        inbox.take()
+
+
+def test_a_reader_whose_driver_calls_exit_does_not_end_without_a_word():
+    """A thread that raises SystemExit ends silently, and its node would wait for data for ever."""
+    inbox = Inbox(capacity=1)
+    thread = ReaderThread(sys.exit, inbox, "reader")
+    thread.start()
+    thread._thread.join(60)
+    with pytest.raises(PluginError, match=r"has called sys\.exit"):
         inbox.take()
 
 
