@@ -36,11 +36,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr, stdtrit
+from scipy.special import stdtrit
 
 Floats = NDArray[np.float64]
-# Beyond this the cubic would overflow; its p-value is 0 or 1 long before.
-_LARGEST_T = 1e90
 
 
 @dataclass(frozen=True)
@@ -66,22 +64,6 @@ class MeanEstimate:
         high = self.mean - self.standard_error * _untransformed(-quantile, self.skewness)
         return low, high
 
-    def p_above(self, bound: float) -> Floats:
-        """One-sided p-values ``[...]``: small values say that the true mean is above ``bound``."""
-        return np.asarray(stdtr(self.degrees_of_freedom, -self._statistic(bound)))
-
-    def p_below(self, bound: float) -> Floats:
-        """One-sided p-values ``[...]``: small values say that the true mean is below ``bound``."""
-        return np.asarray(stdtr(self.degrees_of_freedom, self._statistic(bound)))
-
-    def _statistic(self, bound: float) -> Floats:
-        """Transformed t statistic ``[...]`` of the hypothesis that the true mean is ``bound``."""
-        distance = np.asarray(self.mean - bound)
-        # Without spread, any other bound is infinitely far away.
-        far = np.asarray(np.sign(distance) * _LARGEST_T)
-        t = np.divide(distance, self.standard_error, out=far, where=self.standard_error > 0.0)
-        return _transformed(np.clip(t, -_LARGEST_T, _LARGEST_T), self.skewness)
-
 
 def one_sample(values: Floats) -> MeanEstimate:
     """Estimate the mean from independent values ``[..., n]``, n >= 2."""
@@ -94,28 +76,21 @@ def one_sample(values: Floats) -> MeanEstimate:
 def crossed(values: Floats) -> MeanEstimate:
     """Estimate the mean from drives ``[..., I, J]`` of I >= 2 searches from the same J >= 2 starts."""
     searches, starts = values.shape[-2:]
-    count = searches * starts
-    search_means, start_means = values.mean(axis=-1), values.mean(axis=-2)
-    mean = values.mean(axis=(-2, -1))
-    residual = values - search_means[..., :, None] - start_means[..., None, :] + mean[..., None, None]
-    freedoms = searches - 1.0, starts - 1.0, (searches - 1.0) * (starts - 1.0)
-    of_searches = starts * search_means.var(axis=-1, ddof=1)
-    of_starts = searches * start_means.var(axis=-1, ddof=1)
-    of_residual = (residual**2).sum(axis=(-2, -1)) / freedoms[2]
-    skew_searches = _third_cumulant(search_means) / searches**2
-    skew_starts = _third_cumulant(start_means) / starts**2
-    flat = values.reshape(*values.shape[:-2], count)
-    # An effect that the data do not show is dropped, and the rest is one sample.
-    no_search, no_start = of_searches <= of_residual, of_starts <= of_residual
-    cases = [no_search & no_start, no_search, no_start]
-    both = of_searches + of_starts - of_residual
-    welch = _satterthwaite(both, (of_searches, of_starts, of_residual), freedoms)
-    square = np.select(cases, [flat.var(axis=-1, ddof=1), of_starts, of_searches], both)
-    freedom = np.select(cases, [np.full_like(both, count - 1.0), freedoms[1], freedoms[0]], welch)
-    skew = np.select(
-        cases, [_third_cumulant(flat) / count**2, skew_starts, skew_searches], skew_searches + skew_starts
+    part, start_means = _of_searches(values), values.mean(axis=-2)
+    of_starts, skew_starts = (
+        start_means.var(axis=-1, ddof=1) / starts,
+        _third_cumulant(start_means) / starts**2,
     )
-    return _estimate(mean, square / count, freedom, skew)
+    freedoms = searches - 1.0, starts - 1.0, (searches - 1.0) * (starts - 1.0)
+    # An effect that the data do not show is dropped, and the rest is one sample.
+    no_search, no_start = part.searches <= part.residual, of_starts <= part.residual
+    cases = [no_search & no_start, no_search, no_start]
+    both = part.searches + of_starts - part.residual
+    welch = _satterthwaite(both, (part.searches, of_starts, part.residual), freedoms)
+    variance = np.select(cases, [part.drives, of_starts, part.searches], both)
+    freedom = np.select(cases, [np.full_like(both, searches * starts - 1.0), freedoms[1], freedoms[0]], welch)
+    third = np.select(cases, [part.third_of_drives, skew_starts, part.third], part.third + skew_starts)
+    return _estimate(values.mean(axis=(-2, -1)), variance, freedom, third)
 
 
 def difference(one: Floats, other: Floats) -> MeanEstimate:
@@ -149,7 +124,7 @@ def difference(one: Floats, other: Floats) -> MeanEstimate:
 
 @dataclass(frozen=True)
 class _Method:
-    """Contributions of one method's drives to the variance of a difference; each an array ``[...]``.
+    """Contributions of one method's drives to the variance of their mean; each an array ``[...]``.
 
     Attributes:
         searches: Variance of the mean if the searches are the sample.
@@ -210,14 +185,8 @@ def _third_cumulant(values: Floats) -> Floats:
     return np.asarray(count / ((count - 1) * (count - 2)) * (deviations**3).sum(axis=-1))
 
 
-def _transformed(t: Floats, skewness: Floats) -> Floats:
-    """Hall's transformation ``t + g t^2 / 3 + g^2 t^3 / 27 + g / 6``, which increases with t."""
-    g = skewness
-    return np.asarray(t + g * t**2 / 3.0 + g**2 * t**3 / 27.0 + g / 6.0)
-
-
 def _untransformed(x: Floats, skewness: Floats) -> Floats:
-    """Inverse of `_transformed`: ``(3 / g) (cbrt(1 + g u) - 1)`` with ``u = x - g / 6``.
+    """Inverse of Hall's transformation ``t + g t^2 / 3 + g^2 t^3 / 27 + g / 6``: ``(3 / g) (cbrt(1 + g u) - 1)`` with ``u = x - g / 6``.
 
     It is written without the division by g, so that it holds at skewness 0.
     """
