@@ -8,7 +8,7 @@ from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.report.evidence.registration import Registration, read_registration
+from advnerf_core.report.evidence.registration import read_registration
 
 # Folder of the published stages, beside the sets; each has its record. Files of existing policies lie beside the stages, as ``VICTIM``.
 BUILD, RECORD, VICTIM = "reference", "stage.json", "victim"
@@ -17,9 +17,12 @@ LOST = "cannot be driven again: its scene or victim was not kept"
 
 def is_kept(folder: Path) -> bool:
     """Whether the reference build beside a set has the scene and the victims of every scenario of it."""
-    registration = read_registration(folder)
     kept = {digest for file in (folder.parent / BUILD).glob(f"*/{RECORD}") if (digest := _digest_in(file))}
-    used = _digests_used(folder, registration) if registration is not None else []
+    # Of the first cell of every victim in a scenario: `verify` checks that the others are equal.
+    cells = registration.cells if (registration := read_registration(folder)) is not None else ()
+    first = {(cell.scenario, cell.victim): cell.name for cell in reversed(cells)}
+    files = [file for name in first.values() if (file := folder / f"{name}.json").exists()]
+    used = [digest for file in files for digest in _digests_of(read_json(file))]
     return bool(used) and all(digest in kept for digest in used)
 
 
@@ -47,13 +50,6 @@ def _digest_in(record: Path) -> str | None:
         return read_json(record).get("digest")
     except (AdvnerfError, AttributeError):
         return None
-
-
-def _digests_used(folder: Path, registration: Registration) -> list[str | None]:
-    """Digests of scene and victim, of the first cell of every victim in a scenario: `verify` checks that the others are equal."""
-    first = {(cell.scenario, cell.victim): cell.name for cell in reversed(registration.cells)}
-    files = [file for name in first.values() if (file := folder / f"{name}.json").exists()]
-    return [digest for file in files for digest in _digests_of(read_json(file))]
 
 
 def _digests_of(cell: dict[str, Any]) -> tuple[str | None, str | None]:

@@ -132,10 +132,11 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
         parts += [*(f"{each}\n" for each in said), _tests(data["primary"])]
     parts += [_table(registered), f"![Excess of every drive, by method and domain]({picture_of(name)})\n"]
     if data["filmed"]:
+        filmed = filmed_of(data)["test"]
         baseline = ["the strongest baseline"] if filmed_of(data)["baseline"] else []
         parts.append(
             f"![Drives past {', '.join(['the plain object', *baseline])} and the attack]({film_of(name)})\n\n"
-            f"*Film: {_filmed(data)}.*\n"
+            f"*Film: {place_of(filmed)}{'' if data['primary'] else ', victim ' + filmed['victim']}.*\n"
         )
     if data.get("contrasts"):
         parts += ["### What each difference costs\n", _contrasts(data["contrasts"])]
@@ -194,11 +195,6 @@ def filmed_of(data: Mapping[str, Any]) -> Mapping[str, Any]:
     if len(apart) > 1:
         return max(apart, key=lambda test: test["difference_m"] or 0.0)
     return (data["primary"] or apart)[0]
-
-
-def _filmed(data: Mapping[str, Any]) -> str:
-    test = filmed_of(data)["test"]
-    return place_of(test) + ("" if data["primary"] else f", victim {test['victim']}")
 
 
 def _picture(name: str, data: Mapping[str, Any]) -> list[str]:
@@ -278,21 +274,13 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> str:
                 "95 %": ends(test["low_m"], test["high_m"]),
                 "p deployed, after Holm": "not tested" if test["p"] is None else p_text(test["p_holm"]),
                 "in the learned scene": f"{test['difference_surrogate_m']:+.3f}",
-                "p there, not adjusted": _optional_p(test["p_surrogate"]),
-                "decided after": _decided(test["anytime"]),
+                "p there, not adjusted": "" if test["p_surrogate"] is None else p_text(test["p_surrogate"]),
+                # Search pairs after which the anytime-valid test would have decided.
+                "decided after": f"{test['anytime']['pairs'] or '-'} of {test['anytime']['of_pairs']} pairs",
             }
             for test in tests
         ]
     )
-
-
-def _decided(found: Mapping[str, Any]) -> str:
-    """Number of search pairs after which the anytime-valid test would have decided."""
-    return f"{found['pairs'] or '-'} of {found['of_pairs']} pairs" if found["of_pairs"] else ""
-
-
-def _optional_p(value: float | None) -> str:
-    return "" if value is None else p_text(value)
 
 
 def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:

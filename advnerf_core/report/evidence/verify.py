@@ -7,7 +7,7 @@ here needs torch or a simulator. Each kind of check is a file in `verifying`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,9 +81,12 @@ def _verified(
     numbers = 0
     if not problems:  # numbers of damaged drives add nothing
         numbers, problems = number_problems(folder, published_numbers(evidence, withdrawn, declared))
-    return Verified(
-        folder.name, numbers, _drives(evidence), tuple(problems), tuple(_findings(evidence, problems))
+    findings = tuple(
+        f"{row['scenario']} {row['victim']} does not drive well {row['domain']}: mean |CTE| {row['mean_cte_m']:.4f} m without "
+        f"attack, at most {row['limit_m']:.4f} m was registered; {row['off_track']} drives off the track"
+        for row in ([] if problems else drives_badly(evidence))
     )
+    return Verified(folder.name, numbers, _drives(evidence), tuple(problems), findings)
 
 
 def verify_beside(published: Path) -> tuple[str, ...]:
@@ -100,13 +103,3 @@ def verify_beside(published: Path) -> tuple[str, ...]:
     except (OSError, StopIteration, *_SENSELESS) as error:  # of damaged manifests
         problems.append(f"{page}: cannot be made from the published sets: {error!r}")
     return tuple(problems)
-
-
-def _findings(evidence: Evidence, problems: Sequence[str]) -> Iterator[str]:
-    if problems:
-        return
-    for row in drives_badly(evidence):
-        yield (
-            f"{row['scenario']} {row['victim']} does not drive well {row['domain']}: mean |CTE| {row['mean_cte_m']:.4f} m without "
-            f"attack, at most {row['limit_m']:.4f} m was registered; {row['off_track']} drives off the track"
-        )

@@ -41,7 +41,11 @@ def set_problems(folder: Path, evidence: Evidence, under_way: bool = False) -> I
             damaged = True
             yield problem
     yield from build_problems(evidence)
-    yield from _search_problems(evidence)
+    # Each search has its own attack, possibly driven under several conditions.
+    attacked = [cell for cell in evidence.cells.values() if cell.method not in CONTROLS]
+    yield from _attacks(attacked)
+    yield from _copies(attacked)
+    yield from _shared_searches(evidence, attacked)
     yield from _prediction_problems(folder, evidence)
     yield from _gate_problems(folder, evidence)
     if not damaged:
@@ -53,14 +57,6 @@ def _name_problems(folder: Path, evidence: Evidence) -> Iterator[str]:
     for file, cell in zip(cell_files(folder), evidence.all_cells, strict=True):
         if file.stem != cell.name:
             yield f"{file}: expected the cell of this name, got {cell.name}; restore both from git, or remove the copy"
-
-
-def _search_problems(evidence: Evidence) -> Iterator[str]:
-    """Whether each search has its own attack, possibly driven under several conditions."""
-    attacked = [cell for cell in evidence.cells.values() if cell.method not in CONTROLS]
-    yield from _attacks(attacked)
-    yield from _copies(attacked)
-    yield from _shared_searches(evidence, attacked)
 
 
 def _attacks(attacked: list[CellResult]) -> Iterator[str]:

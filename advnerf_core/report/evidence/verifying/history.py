@@ -105,7 +105,15 @@ def _since_added(changes: list[Change]) -> list[Change]:
 
 def _gone(history: History, published: Path, log: Log) -> Iterator[str]:
     """Sets, their files and registered scenarios that were committed once and are now missing without a log entry."""
-    once = [name for name in history.below() if _is_kept(name)]
+    # What belongs to a set and is not generated from its other files.
+    once = [
+        name
+        for name in history.below()
+        if "/" in name
+        and name.endswith(".json")
+        and not name.startswith(f"{BUILD}/")
+        and not name.endswith(f"/{SET}")
+    ]
     for kind, names in (
         ("set", {name.split("/")[0] for name in once if not (published / name.split("/")[0]).is_dir()}),
         ("file", {name for name in once if not (published / name).exists()}),
@@ -115,16 +123,6 @@ def _gone(history: History, published: Path, log: Log) -> Iterator[str]:
             gone_with_its_set = kind != "set" and not (published / name.split("/")[0]).is_dir()
             if (kind, name) not in log and not gone_with_its_set:
                 yield f"{published}: the {kind} {name} was committed once, is not there, and {LOG} does not say why"
-
-
-def _is_kept(name: str) -> bool:
-    """Whether a published file belongs to a set and is not generated from its other files."""
-    return (
-        "/" in name
-        and name.endswith(".json")
-        and not name.startswith(f"{BUILD}/")
-        and not name.endswith(f"/{SET}")
-    )
 
 
 def _scenarios_once(history: History) -> set[str]:

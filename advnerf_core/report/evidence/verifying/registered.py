@@ -65,7 +65,11 @@ def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
     if not clip.startswith(cell.name):
         yield f"{cell.name}: names the clip of another cell, {clip}"
     registered_on = evidence.registration.date
-    if not _not_before(cell.date, registered_on):
+    try:
+        is_older = datetime.fromisoformat(cell.date) < datetime.fromisoformat(registered_on)
+    except (ValueError, TypeError):  # no date, or one without a time zone
+        is_older = True
+    if is_older:
         yield f"{cell.name}: expected a date from {registered_on} on, when it was registered, got {cell.date}"
 
 
@@ -77,13 +81,6 @@ def _settings_of(scenario: RegisteredScenario, victim: str) -> Mapping[str, Any]
     policy = {name: recipe[name] for name in scenario.settings["policy"]}
     architecture = {name: value for name, value in recipe.items() if name not in policy}
     return {**scenario.settings, "policy": policy, "architecture": architecture}
-
-
-def _not_before(date: str, other: str) -> bool:
-    try:
-        return datetime.fromisoformat(date) >= datetime.fromisoformat(other)
-    except (ValueError, TypeError):  # no date, or one without a time zone
-        return False
 
 
 def build_problems(evidence: Evidence) -> Iterator[str]:
