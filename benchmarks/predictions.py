@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.documents import read_json
-from advnerf_core.report.evidence.prediction_score import (
+from advnerf_core.report.evidence.results import Evidence, read_evidence
+from advnerf_core.report.evidence.verifying.layout import complete_sets
+from advnerf_core.report.predictions import (
     LEVEL,
     Score,
     score_bands,
 )
-from advnerf_core.report.evidence.results import Evidence, read_evidence
-from advnerf_core.report.evidence.verifying.layout import complete_sets
 from benchmarks.results import REPOSITORY, LedgerRow
 from benchmarks.transfer_factor import (
     Transfer,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import base64
-import io
 import os
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
@@ -76,21 +76,16 @@ def write_clip(
     """
     if not tracks:
         raise ValueError("expected at least one drive for a clip, got none")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
-    try:
+    with _in_place_of(path) as temporary:
         for quality in _QUALITIES:
             frames = compose(tracks, rate_hz, off_track_m)
             _encode(temporary, rate_hz, frames, {"crf": str(quality), "preset": "slow", "tune": "animation"})
             size = temporary.stat().st_size
             if size <= MAX_BYTES:
-                os.replace(temporary, path)
                 return path
-    finally:
-        temporary.unlink(missing_ok=True)
-    raise ValueError(
-        f"expected clip {path.name} under {MAX_BYTES} bytes, got {size} at the coarsest setting: film fewer frames"
-    )
+        raise ValueError(
+            f"expected clip {path.name} under {MAX_BYTES} bytes, got {size} at the coarsest setting: film fewer frames"
+        )
 
 
 def write_film(path: Path, tracks: Sequence[ClipTrack], rate_hz: float, off_track_m: float) -> Film:
@@ -102,14 +97,21 @@ def write_film(path: Path, tracks: Sequence[ClipTrack], rate_hz: float, off_trac
 
 def write_video(path: Path, frames: Iterable[Frames], rate_hz: float = 10.0) -> Path:
     """Write images ``[H, W, 3]`` of uint8 RGB as an H.264 video in MP4. The file appears when it is complete."""
+    with _in_place_of(path) as temporary:
+        _encode(temporary, rate_hz, frames, {})
+    return path
+
+
+@contextmanager
+def _in_place_of(path: Path) -> Iterator[Path]:
+    """A file to write, which then takes the place of a film; not after an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
     try:
-        _encode(temporary, rate_hz, frames, {})
+        yield temporary
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
-    return path
 
 
 def compose(tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: float = 0.4) -> Iterator[Frames]:
@@ -129,15 +131,6 @@ def compose(tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: flo
 def read_clip(path: Path) -> Frames:
     """Decode a whole clip to RGB, ``[N, height, width, 3]``."""
     return np.stack([frame for *_, frame in read_video(path)])
-
-
-def webp(frames: Sequence[Image.Image], frame_ms: float, quality: int) -> bytes:
-    """An animated picture that repeats, as it stands in a README."""
-    buffer = io.BytesIO()
-    first, *others = frames
-    options = {"duration": round(frame_ms), "loop": 0, "quality": quality, "method": 6}
-    first.save(buffer, "WEBP", save_all=True, append_images=others, **options)
-    return buffer.getvalue()
 
 
 def film_uri(file: Path) -> str:

@@ -1,4 +1,4 @@
-"""Predicted and measured excess of attacks. No prediction used a drive with its attack."""
+"""Predicted and measured excess of attacks, and scores of predicted bands. No prediction used a drive with its attack."""
 
 # ruff: noqa: RUF001 (typography for readers: dashes)
 
@@ -10,14 +10,45 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.report.conditions import order_of, style_of
-from advnerf_core.report.evidence.prediction_score import score_bands
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.text_table import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+LEVEL = 0.8
+
+
+@dataclass(frozen=True)
+class Score:
+    """Comparison of one set's bands with its measured drives.
+
+    Attributes:
+        held: Number of drives within their bands.
+        score: Mean interval score, in the unit of the bands; smaller is better.
+    """
+
+    held: int
+    drives: int
+    score: float
+
+
+def interval_score(low: ArrayLike, high: ArrayLike, measured: ArrayLike) -> Floats:
+    """Interval score of each measured value (Gneiting and Raftery 2007, equation 43): width, and 2 / alpha times how far the value is outside."""
+    lows, highs, values = (np.asarray(each, np.float64) for each in (low, high, measured))
+    outside = np.maximum(lows - values, 0.0) + np.maximum(values - highs, 0.0)
+    return np.asarray((highs - lows) + 2.0 / (1.0 - LEVEL) * outside)
+
+
+def score_bands(bands: Floats, measured: Floats) -> Score:
+    """Score bands ``[..., 2]`` of drives ``[...]``, both in one unit."""
+    low, high = bands[..., 0], bands[..., 1]
+    held = int(((low <= measured) & (measured <= high)).sum())
+    return Score(held, measured.size, float(interval_score(low, high, measured).mean()))
 
 
 @dataclass(frozen=True)

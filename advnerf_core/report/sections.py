@@ -22,23 +22,7 @@ _DIFFERENCE_GAIN = 4
 
 def page_sections(data: ReportData, table: ResultTable) -> list[tuple[str, Markup]]:
     """Headings and HTML; parts that were not measured are named as such."""
-    drawn = _fragments(data, table)
-    world = [("overview", "The world")] if data.overview is not None else []
-    parts = [("texture", "What the panel showed")] if data.textures else []
-    parts += [("views", "Learned and real pictures")] if data.fidelity else []
-    if data.live:
-        parts += [("laps", "Laps without attack"), ("timing", "Live timing")]
-    parts.append(("manifest", HOW))
-
-    def made(*wanted: tuple[str, str]) -> list[tuple[str, Markup]]:
-        return [(heading, Markup(getattr(drawn, name)())) for name, heading in wanted]
-
-    driven = [(each["drives"].scenario.capitalize(), Markup(drawn.driven(each))) for each in _driven(data)]
-    return [*made(("fidelity", "How true the learned scene is"), *world), *driven, *made(*parts)]
-
-
-def _fragments(data: ReportData, table: ResultTable) -> Any:
-    return fragments(
+    drawn = fragments(
         "sections.html",
         data=data,
         image=lambda picture: image_uri(picture, quality=88),
@@ -51,6 +35,18 @@ def _fragments(data: ReportData, table: ResultTable) -> Any:
         fidelity_rows=_fidelity_numbers(data),
         missing=lambda part: data.not_measured.get(part, ""),
     )
+    world = [("overview", "The world")] if data.overview is not None else []
+    parts = [("texture", "What the panel showed")] if data.textures else []
+    parts += [("views", "Learned and real pictures")] if data.fidelity else []
+    if data.live:
+        parts += [("laps", "Laps without attack"), ("timing", "Live timing")]
+    parts.append(("manifest", HOW))
+
+    def made(*wanted: tuple[str, str]) -> list[tuple[str, Markup]]:
+        return [(heading, Markup(getattr(drawn, name)())) for name, heading in wanted]
+
+    driven = [(each["drives"].scenario.capitalize(), Markup(drawn.driven(each))) for each in _driven(data)]
+    return [*made(("fidelity", "How true the learned scene is"), *world), *driven, *made(*parts)]
 
 
 def _driven(data: ReportData) -> Iterator[dict[str, Any]]:

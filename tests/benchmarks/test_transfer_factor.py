@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from advnerf_core.report.evidence.prediction_score import LEVEL, score_bands
 from advnerf_core.report.evidence.results import Evidence, read_evidence
+from advnerf_core.report.predictions import LEVEL, score_bands
 from benchmarks.planted_changes import write_simulated_set
 from benchmarks.transfer_factor import (
     PRIOR_SPREAD,

@@ -129,7 +129,11 @@ def write_above(
         _draw_map(figure.add_axes(_MAP), groups, registered.reference_path(), registered.off_track_m, place)
         _draw_deviation(figure.add_axes(_TIME), groups, registered.off_track_m, registered.dt_s)
         _draw_stills(figure, evidence, filmed, film)
-        _add_legend(figure, groups, place)
+        handles = [*_handles(groups), Line2D([], [], color=LIGHT["muted"], lw=1.1, label="edge of the track")]
+        if place is not None:
+            label = "object" + " (estimated)" * place.estimated
+            handles.append(Line2D([], [], color=LIGHT["ink"], lw=4.0, label=label))
+        figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.01, 0.995), ncols=len(handles))
     write_atomically(target, _webp(figure))
     return target
 
@@ -276,16 +280,6 @@ def _frame_at(film: Path, when_s: float) -> list[NDArray[np.uint8]]:
 
 def _handles(groups: Sequence[DriveGroup]) -> list[Line2D]:
     return [Line2D([], [], color=group.colour, lw=2.2, label=group.label) for group in groups]
-
-
-def _add_legend(figure: Figure, groups: Sequence[DriveGroup], place: ObjectPlace | None) -> None:
-    handles = _handles(groups)
-    handles.append(Line2D([], [], color=LIGHT["muted"], lw=1.1, label="edge of the track"))
-    if place is not None:
-        handles.append(
-            Line2D([], [], color=LIGHT["ink"], lw=4.0, label="object" + " (estimated)" * place.estimated)
-        )
-    figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.01, 0.995), ncols=len(handles))
 
 
 def _webp(figure: Figure) -> bytes:

@@ -114,7 +114,9 @@ def _storyboard(vehicle: AuditedVehicle, placed: AuditedObject, drives: AuditedD
     pose, init = placed.pose, xosc.Init()
     where = xosc.WorldPosition(pose.x_m, pose.y_m, pose.z_m, pose.yaw_rad, pose.pitch_rad, pose.roll_rad)
     init.add_init_action(OBJECT, xosc.TeleportAction(where))
-    init.add_init_action(EGO, xosc.TeleportAction(_start(drives)))
+    # Of the stored drive, else of the path, else the first judging start.
+    first: list[RoutePoint | JudgedStart] = [*drives.route, *drives.path, *drives.starts]
+    init.add_init_action(EGO, xosc.TeleportAction(_position(first[0])))
     step = xosc.TransitionDynamics(xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0)
     init.add_init_action(EGO, xosc.AbsoluteSpeedAction(vehicle.speed_mps, step))
     if len(drives.path) > 1:
@@ -126,13 +128,6 @@ def _storyboard(vehicle: AuditedVehicle, placed: AuditedObject, drives: AuditedD
     if len(drives.route) > 1:
         storyboard.add_maneuver(_replay(drives.route), EGO)
     return storyboard
-
-
-def _start(drives: AuditedDrives) -> Any:
-    """Position of the vehicle at the beginning: of the stored drive, else of the path, else the first judging start."""
-    points: list[RoutePoint | JudgedStart] = [*drives.route, *drives.path, *drives.starts]
-    first = points[0]
-    return xosc.WorldPosition(first.x_m, first.y_m, 0.0, first.yaw_rad)
 
 
 def _route(path: tuple[RoutePoint, ...]) -> Any:
@@ -162,5 +157,5 @@ def _replay(route: tuple[RoutePoint, ...]) -> Any:
     return maneuver
 
 
-def _position(point: RoutePoint) -> Any:
+def _position(point: RoutePoint | JudgedStart) -> Any:
     return xosc.WorldPosition(point.x_m, point.y_m, 0.0, point.yaw_rad)

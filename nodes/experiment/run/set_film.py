@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from PIL import Image
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.report.clips import read_clip, webp
+from advnerf_core.report.clips import read_clip
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.page import film_of, filmed_of, maps_of
 from advnerf_core.report.evidence.results import read_evidence
@@ -30,13 +31,15 @@ def write_film(experiment: Experiment, published: Path) -> Path | None:
     clips = _clips(experiment, published, filmed_of(data)) if maps_of(data) else []
     if not clips or not all(clip.exists() for clip in clips):
         return None
-    frames = _side_by_side([read_clip(clip)[::_EVERY] for clip in clips])
+    first, *others = _side_by_side([read_clip(clip)[::_EVERY] for clip in clips])
+    animated: dict[str, Any] = {"save_all": True, "append_images": others, "duration": _FRAME_MS, "loop": 0}
     for quality in _QUALITIES:
-        data = webp(frames, _FRAME_MS, quality)
-        if len(data) <= MOST_BYTES:
+        film = io.BytesIO()
+        first.save(film, "WEBP", quality=quality, method=6, **animated)
+        if film.tell() <= MOST_BYTES:
             break
     target = published.parent / film_of(published.name)
-    write_atomically(target, data)
+    write_atomically(target, film.getvalue())
     return target
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from advnerf_core.report.evidence.prediction_score import interval_score, score_bands
+from advnerf_core.report.predictions import interval_score, score_bands
 
 
 def test_the_interval_score_is_that_of_the_paper() -> None:
