@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results import record_row
+from nodes.experiment.engine.run_folder import ATTACK
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.live import LiveNodes, LiveRun, drive_live
 from nodes.experiment.steps.run import load_experiment
-from nodes.experiment.steps.search_files import ATTACK
 from nodes.lab.trials.trial import SpoiledError
 
 CELL = Cell("track", "hardened", "gradient", 0)

@@ -20,6 +20,7 @@ from advnerf_core.report.evidence.hardness import (
     read_hardness,
     write_hardness,
 )
+from nodes.experiment.run.registering import VALIDATED_ON
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
 from nodes.experiment.show.victims import load_victim
@@ -30,7 +31,6 @@ from nodes.experiment.steps.attack import (
     planned_evaluations,
     search_settings,
 )
-from nodes.experiment.steps.verdicts import VALIDATED_ON, trained_on
 
 _SEED = 20_000  # no search uses it
 
@@ -60,7 +60,7 @@ def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVer
         victim=victim,
         policy_sha256=policy.sha256,
         recipe=experiment.config.training(victim).policy.recipe,
-        trained_on=trained_on(experiment.config, victim),
+        trained_on=experiment.config.training(victim).policy.families,
         validated_on=VALIDATED_ON,
         textures=count,
         seed=_SEED,

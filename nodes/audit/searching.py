@@ -18,11 +18,11 @@ from nodes.audit.plan import AuditPlan, as_listed
 from nodes.audit.question import SELECTION_STARTS, VICTIM
 from nodes.audit.schedule import LEARNING_RATE, PlannedSearch, Round, planned, rounds_for
 from nodes.audit.spots import Spot
+from nodes.experiment.engine.run_folder import ATTACK, SEARCHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.object_kinds import PANEL
 from nodes.experiment.run.cells import search_cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.search_files import ATTACK, SEARCHED
 from nodes.runtime.progress import Report, StageDisplay
 
 SEARCHES = "searches"

@@ -29,8 +29,11 @@ from nodes.runtime.errors import ConfigError
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# Folder of the cells in a run folder.
+# Folder of the cells in a run folder, and files of a cell's search in its folder there.
 CELLS = "cells"
+FROZEN, SEARCHED, ATTACK = "frozen.json", "surrogate.json", "attack.safetensors"
+# A cell's note that its texture was rounded to half precision before it was driven past.
+THETA = "float16"
 _MANIFEST = "manifest.json"
 # Libraries whose versions the manifest notes.
 _LIBRARIES = (

@@ -18,7 +18,6 @@ from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically, write_json
 from advnerf_core.places import require_utf8
 from advnerf_core.plugins import name_in_results
-from nodes.experiment.engine.telling import telling
 from nodes.experiment.node.job import REQUEST, TOGETHER_STATE, is_begun
 from nodes.experiment.node.poses import draw_found
 from nodes.experiment.node.prepare import load_request, prepare, request_text, searched_cell
@@ -26,9 +25,9 @@ from nodes.experiment.plan.rules import check_options
 from nodes.experiment.plan.space_config import MeshShapeConfig, PlacesConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.victims import look_at_given
-from nodes.experiment.steps.attack import Prepared, search_settings
+from nodes.experiment.steps.attack import Prepared, search_settings, telling
 from nodes.experiment.steps.attack import attack_file as make_attack_file
-from nodes.experiment.steps.shared_search import search_key
+from nodes.experiment.steps.keys import search_key
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import StageDisplay
 
@@ -172,9 +171,7 @@ def _run_seed(prepared: Prepared, display: StageDisplay, on_evaluation: OnEvalua
     state_path = prepared.experiment.folder / f"{name}.state.safetensors"
     report = display.start(name)
     report(0.0, "drive without attack")
-    told = telling(
-        planned_evaluations(prepared), report, prepared.clean_drive, objective=prepared.problem.objective
-    )
+    told = telling(planned_evaluations(prepared), report, prepared.clean_drive, prepared.problem.objective)
     result = search(prepared, state_path, _both(told, on_evaluation))
     _keep(prepared, result)
     state_path.unlink(missing_ok=True)
@@ -188,11 +185,8 @@ def _run_together(
     on_prepared: Callable[[Prepared], None] | None,
 ) -> list[Path]:
     """All seeds of a gradient attack in one batch; their files are written when all are finished."""
-    seeds, wanted, state_path = (
-        experiment.config.seeds,
-        experiment.config.attack,
-        experiment.folder / TOGETHER_STATE,
-    )
+    seeds, wanted = experiment.config.seeds, experiment.config.attack
+    state_path = experiment.folder / TOGETHER_STATE
     files = [attack_file(experiment.folder, seed) for seed in seeds]
     if all([_is_done(experiment, seed) for seed in seeds]):
         for seed in seeds:

@@ -19,6 +19,7 @@ from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import EMPTY
 from advnerf_core.report.reference import DOMAINS, Domain
 from nodes.experiment.engine.artefact import read_artefact
+from nodes.experiment.engine.run_folder import ATTACK, SEARCHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face, panel_of, wanted_face
@@ -28,7 +29,6 @@ from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.frozen import frozen_hashes
 from nodes.experiment.steps.keys import driven_folder
 from nodes.experiment.steps.live import extra_runs, lab_of
-from nodes.experiment.steps.search_files import ATTACK, SEARCHED
 from nodes.experiment.steps.steering_gate import steering_of_victims
 from nodes.lab.trials import evaluation
 from nodes.runtime.errors import RuntimeFault

@@ -16,7 +16,6 @@ from advnerf_core.strict import StrictModel
 from nodes.experiment.plan import rules
 from nodes.experiment.plan.carriers import CarrierConfig, ComposedConfig, FaceCarrier
 from nodes.experiment.plan.deploy_config import DeployConfig
-from nodes.experiment.plan.maps_config import MapsConfig
 from nodes.experiment.plan.numbers import Length, Positive, PositiveNumber
 from nodes.experiment.plan.over import OverConfig
 from nodes.experiment.plan.placed import WantedObject
@@ -30,7 +29,7 @@ from nodes.experiment.plan.sections import (
     SceneConfig,
     ViewConfig,
 )
-from nodes.experiment.plan.space_config import ColoursConfig, SpaceConfig
+from nodes.experiment.plan.space_config import ColoursConfig, MapsConfig, SpaceConfig
 from nodes.experiment.plan.victims import (
     HARDENED,
     NAIVE,

@@ -26,10 +26,15 @@ from nodes.experiment.steps.attack import surrogate_part
 from nodes.experiment.steps.deploy import cell_data
 from nodes.experiment.steps.films import film_cell
 from nodes.experiment.steps.frozen import check_frozen, freeze
-from nodes.experiment.steps.keys import clean_folder, require_known, stages_needed
+from nodes.experiment.steps.keys import (
+    clean_folder,
+    drop_other_search,
+    require_known,
+    stages_needed,
+    take_search,
+)
 from nodes.experiment.steps.live import LiveNodes
 from nodes.experiment.steps.pipeline import stages_of, stages_of_cells
-from nodes.experiment.steps.shared_search import drop_other_search, take_search
 from nodes.runtime.progress import Report
 
 

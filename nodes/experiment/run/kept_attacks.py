@@ -13,13 +13,18 @@ from advnerf_core.attack.artifact import AttackFile, AttackFileError, load_attac
 from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.verify import Verified
+from nodes.experiment.engine.run_folder import ATTACK, THETA
 from nodes.experiment.run.store import CellStatus, Store
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.steps.search_files import ATTACK, is_published_with_its_attack
 
 FOLDER = "attacks"
 # A larger attack is published only if its set claims something about its method.
 SMALL_BYTES = 100_000
+
+
+def is_published_with_its_attack(cell: CellResult) -> bool:
+    """Whether a cell's attack must be published with it; cells from before textures were rounded have none."""
+    return cell.attack_id is not None and cell.extra.get("theta") == THETA
 
 
 def attack_file(folder: Path, attack_id: str) -> Path:

@@ -23,6 +23,7 @@ from advnerf_core.report.evidence.kept_build import LOST, is_kept
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.verifying.git import last_commit
 from nodes.experiment.engine.artefact import BUILD, VICTIM, Artefact, ReferenceBuild
+from nodes.experiment.engine.run_folder import ATTACK
 from nodes.experiment.engine.stages import key_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench
@@ -33,7 +34,6 @@ from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import surrogate_drives, surrogate_part
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import prepare_victims
-from nodes.experiment.steps.search_files import ATTACK
 from nodes.runtime.errors import RuntimeFault
 
 # Of positions, between machines: sums are taken in another order, and a search takes many steps.

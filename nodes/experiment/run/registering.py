@@ -38,7 +38,9 @@ from nodes.experiment.show.given import given_in, given_victim
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.attack import planned_evaluations
 from nodes.experiment.steps.keys import own_recipes, pinned_code, registered_settings, require_searchable
-from nodes.experiment.steps.verdicts import VALIDATED_ON, trained_on, unseen
+
+# Families of random textures that judge a victim; `benchmarks.hardening` makes the verdicts.
+VALIDATED_ON = ("random_natural",)
 
 
 def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> Registration:
@@ -131,9 +133,11 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
         found = [each for each in cells if each.scenario == scenario]
         config = experiment.of(found[0]).config
         victim = config.main_victim
+        trained_on = config.training(victim).policy.families
         ran = dict.fromkeys(cell.method for cell in found if cell.victim == victim and cell.searched)
         of_textures = config.space.kind not in RANDOM_ALONE
-        methods = unseen(ran, config) if of_textures else list(ran)
+        # Textures of the other families neither trained nor judged the victim.
+        methods = [name for name in ran if not of_textures or name not in (*trained_on, *VALIDATED_ON)]
         against = [name for name in methods if name not in (GRADIENT, COARSE_GRADIENT)]
         if GRADIENT not in methods or not against:
             continue
@@ -142,12 +146,12 @@ def primary_tests(experiment: Experiment, cells: Sequence[Cell]) -> list[Primary
                 f"{scenario}: expected deploy.through world or nodes, as its tests are about deployed drives, got nothing; deploy them, or leave "
                 f"{GRADIENT} or its baselines out of the methods"
             )
-        families = unseen(RANDOM_FAMILIES, config)
+        families = [name for name in RANDOM_FAMILIES if name not in (*trained_on, *VALIDATED_ON)]
         lacking = lacking_baselines(methods, _coarse_cells_differ(config), families)
         if of_textures and lacking:
             raise SetError(
                 f"{scenario}: expected the baselines that a test of the gradient needs, got {', '.join(against)} "
-                f"(textures of {', '.join(trained_on(config, victim))} train the victim, those of {', '.join(VALIDATED_ON)} judge it); add {'; '.join(lacking)} to "
+                f"(textures of {', '.join(trained_on)} train the victim, those of {', '.join(VALIDATED_ON)} judge it); add {'; '.join(lacking)} to "
                 "the methods"
             )
         if scenario in sampled:

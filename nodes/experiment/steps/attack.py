@@ -18,11 +18,12 @@ from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive_and_value
 from advnerf_core.attack.image_gradients import agrees_in_bfloat16
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
+from advnerf_core.attack.objective import CrossTrackError, Objective
 from advnerf_core.attack.objectives import CTE, load_objective, objective_entry, objective_key
 from advnerf_core.attack.on_device import on_chosen_device, said_of_device
 from advnerf_core.attack.problem import ZeroGradientError
 from advnerf_core.attack.robustness import Disturbances, Smoothness
-from advnerf_core.attack.search.record import SearchResult
+from advnerf_core.attack.search.record import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space, half_precision
 from advnerf_core.documents import read_json
 from advnerf_core.driving.clean_drive import CleanDrive
@@ -32,7 +33,7 @@ from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.report.conditions import EMPTY
 from hardware.worlds.world import World
 from nodes.experiment.engine.artefact import Settings, hash_of
-from nodes.experiment.engine.telling import telling
+from nodes.experiment.engine.run_folder import ATTACK, SEARCHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import keep_title
 from nodes.experiment.plan.space_config import (
@@ -48,9 +49,7 @@ from nodes.experiment.show.learned_scene import baked_file, load_field, scene_sh
 from nodes.experiment.show.spaces import dress, over_the_world, shown_there
 from nodes.experiment.show.victims import load_victim, told
 from nodes.experiment.steps.frozen import frozen_for, hardness_before
-from nodes.experiment.steps.keys import registered_settings
-from nodes.experiment.steps.search_files import ATTACK, SEARCHED
-from nodes.experiment.steps.shared_search import search_key
+from nodes.experiment.steps.keys import registered_settings, search_key
 from nodes.runtime.errors import ConfigError
 
 _STATE = "state.safetensors"
@@ -344,10 +343,38 @@ def _search(prepared: Prepared, folder: Path, report: Callable[..., None]) -> Se
     method = load_method(cell.code)
     keep_title(folder.parent, cell.method, method.title)
     budget = search_settings(experiment, method)
-    told = telling(method.evaluations(problem, budget), report, objective=problem.objective)
+    told = telling(method.evaluations(problem, budget), report, None, problem.objective)
     run = SearchRun(cell.seed, folder / _STATE, told, settings.key)
     with prepared.telling_unseen():
         return prepared.space.search(cell.code, on_chosen_device(problem), budget, run)
+
+
+def telling(
+    evaluations: int,
+    report: Callable[[float, str], None],
+    clean: CleanDrive | None,
+    objective: Objective,
+) -> OnEvaluation:
+    """A callback that reports evaluations as progress: the finished fraction, and as text the last and the best total, and the total without attack.
+
+    The last and the best value of an objective other than ``cte`` are reported too.
+    """
+    best: Evaluation | None = None
+    beside = "" if clean is None else f", {clean.short}"
+
+    def told(evaluation: Evaluation) -> None:
+        nonlocal best
+        if best is None or evaluation.value > best.value:
+            best = evaluation
+        done, total_m = evaluation.iteration + 1, evaluation.predicted_total_cte_m
+        best_m = best.predicted_total_cte_m
+        text = f"total CTE {total_m:.1f} m, best {best_m:.1f} m"
+        if objective != CrossTrackError():
+            unit = objective.unit
+            text = f"{evaluation.value:.2f} {unit}, best {best.value:.2f} {unit}, total CTE {total_m:.1f} m"
+        report(done / evaluations, f"{done}/{evaluations}, {text}{beside}")
+
+    return told
 
 
 def attack_file(prepared: Prepared, result: SearchResult) -> AttackFile:

@@ -15,6 +15,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import kept_drives
 from hardware.worlds.world import World
+from nodes.experiment.engine.run_folder import ATTACK, SEARCHED, THETA
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import DeployedDrive
@@ -22,7 +23,6 @@ from nodes.experiment.show.drives import deployed_drives, totals
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import dress_cell
 from nodes.experiment.steps.live import LiveNodes, LiveRun, as_drive, drive_until_it_counts
-from nodes.experiment.steps.search_files import ATTACK, SEARCHED, THETA
 from nodes.lab.trials.tries import NotDrivenError
 
 DRIVES = "drives.json"

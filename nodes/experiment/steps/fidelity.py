@@ -30,6 +30,7 @@ from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import Rgb
 from nodes.bags.decoded import read_decoded, read_poses
 from nodes.control.pose_buffer import PoseBuffer
+from nodes.experiment.engine.run_folder import ATTACK
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.drives import deployed_drives
@@ -40,7 +41,6 @@ from nodes.experiment.show.spaces import dress, make_space, shown_there
 from nodes.experiment.show.victims import load_victim, told
 from nodes.experiment.steps.attack import Prepared, from_measured_starts, load_found
 from nodes.experiment.steps.deploy import DRIVES, live_name
-from nodes.experiment.steps.search_files import ATTACK
 from nodes.runtime.errors import BagError, RuntimeFault
 from nodes.runtime.messages import stamp_ns
 from nodes.runtime.pictures import rgb_image

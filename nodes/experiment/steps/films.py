@@ -15,12 +15,12 @@ from advnerf_core.report.clips import ClipTrack, write_clip, write_film
 from advnerf_core.report.conditions import NONE, compared, style_of
 from advnerf_core.report.data import Film
 from hardware.worlds.world import World
+from nodes.experiment.engine.run_folder import SEARCHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps.attack import dress_cell, load_shown
 from nodes.experiment.steps.deploy import DRIVES
 from nodes.experiment.steps.keys import driven_folder
-from nodes.experiment.steps.search_files import SEARCHED
 from nodes.lab.trials import evaluation
 
 _FRAME_S = 0.1  # of films: finer ticks are not all filmed

@@ -6,15 +6,15 @@ from pathlib import Path
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_json
+from advnerf_core.report.evidence.hardness import FILE, read_hardness
 from nodes.experiment.engine.artefact import hash_of
+from nodes.experiment.engine.run_folder import FROZEN
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import has_face, panel_of
 from nodes.experiment.show.given import victim_sha256
 from nodes.experiment.show.learned_scene import scene_sha256
 from nodes.experiment.show.spaces import named_objects
-from nodes.experiment.steps.search_files import FROZEN
-from nodes.experiment.steps.verdicts import passing_digest
 from nodes.runtime.errors import RuntimeFault
 
 
@@ -71,7 +71,9 @@ def freeze(experiment: Experiment, cell: Cell, folder: Path) -> None:
     """Write the hashes fixed before the search of a cell, once."""
     if not (folder / FROZEN).exists():
         fixed = frozen_for(experiment, cell)
-        fixed["hardness"] = passing_digest(experiment, fixed["policy"])
+        # Without a passing verdict no page calls the victim hardened.
+        verdict = read_hardness(experiment.folder / FILE).passing(fixed["policy"])
+        fixed["hardness"] = "" if verdict is None else verdict.digest
         write_json(folder / FROZEN, fixed)
 
 

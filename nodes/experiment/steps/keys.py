@@ -1,16 +1,19 @@
-"""Keys of cells, which decide whether they are finished; and the folders that their methods share."""
+"""Keys of cells, which decide whether they are finished; their files, and the folders and searches that cells share."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.methods import METHODS, black_box_methods, load_method, method_digest, require_method
 from advnerf_core.attack.objectives import OBJECTIVES, ON_THE_PATH, load_objective, objective_key
+from advnerf_core.files import write_atomically
 from advnerf_core.plugins import PluginError, name_in_results
 from advnerf_core.report.conditions import EMPTY, NONE
-from nodes.experiment.engine.artefact import Settings, digests_in, hash_of
+from nodes.experiment.engine.artefact import Settings, digests_in, has_key, hash_of, write_key
+from nodes.experiment.engine.run_folder import ATTACK, SEARCHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.config import POLICY, ExperimentConfig
 from nodes.experiment.plan.object_kinds import files_of
@@ -23,6 +26,7 @@ from nodes.experiment.show.spaces import named_objects
 from nodes.experiment.steps import bake
 from nodes.runtime.errors import RuntimeFault
 
+_SEARCH_KEY = "search_key.json"
 # Like a stage's version (`pipeline.VERSIONS`): raised when the result of a cell changes with the same settings.
 VERSION = 5  # 5: gradients are followed in steps of 0.3 instead of 0.1
 # Settings that a cell does not depend on: other cells, memory limits, and values that are separate inputs below.
@@ -255,3 +259,35 @@ def driven_folder(experiment: Experiment, cell: Cell) -> Path:
     """Folder of a cell's drives in the experiment; its methods share the drives without attack."""
     folder = experiment.cell_folder(cell)
     return clean_folder(experiment, cell, folder) if cell.method == NONE else folder
+
+
+def search_key(experiment: Experiment, cell: Cell) -> str:
+    """Hash of everything that a search, and the drives in the surrogate past its attack, depend on."""
+    return cell_settings(experiment, cell, deployed=False).key
+
+
+def drop_other_search(experiment: Experiment, cell: Cell, folder: Path) -> None:
+    """Remove a cell's folder if its search was of another policy, scene, place or settings: its results are not this cell's."""
+    file = folder / _SEARCH_KEY
+    if file.exists() and not has_key(file, search_key(experiment, cell)):
+        shutil.rmtree(folder)
+
+
+def take_search(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
+    """Copy the search of a cell whose folder is beside this one's if it is the same, and return that folder.
+
+    Cells that differ only in their deployment have one search. Nothing happens if this cell has begun its own. The stages before the
+    cells are finished.
+    """
+    settings = cell_settings(experiment, cell, deployed=False)
+    if has_key(folder / _SEARCH_KEY, settings.key):
+        return None
+    beside = sorted(file for file in folder.parent.glob(f"*/{_SEARCH_KEY}") if file.parent != folder)
+    same = (file.parent for file in beside if has_key(file, settings.key))
+    if (found := next((each for each in same if (each / SEARCHED).exists()), None)) is not None:
+        # The drives come last: without them the search counts as unfinished.
+        for name in (ATTACK, SEARCHED):
+            if (found / name).exists():
+                write_atomically(folder / name, (found / name).read_bytes())
+    write_key(folder / _SEARCH_KEY, settings.key, settings)
+    return found

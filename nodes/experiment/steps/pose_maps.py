@@ -21,14 +21,13 @@ from advnerf_core.attack.pose_plots import draw_landscape, draw_robustness
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.search.poses import placed_sensor
 from advnerf_core.files import write_atomically
+from nodes.experiment.engine.run_folder import ATTACK
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.plan.maps_config import LandscapeConfig, MapsConfig, RobustnessMapConfig
-from nodes.experiment.plan.space_config import PlacesConfig
+from nodes.experiment.plan.space_config import LandscapeConfig, MapsConfig, PlacesConfig, RobustnessMapConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import make_space
 from nodes.experiment.steps.attack import Prepared
 from nodes.experiment.steps.keys import NoSuchCellError
-from nodes.experiment.steps.search_files import ATTACK
 from nodes.runtime.progress import Report
 
 

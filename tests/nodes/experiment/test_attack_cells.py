@@ -35,8 +35,14 @@ from nodes.experiment.steps import attack, frozen, run
 from nodes.experiment.steps.attack import load_shown, surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, cell_data
 from nodes.experiment.steps.films import film_cell
-from nodes.experiment.steps.keys import NoSuchCellError, cell_settings, clean_folder, settings_hash
-from nodes.experiment.steps.shared_search import search_key, take_search
+from nodes.experiment.steps.keys import (
+    NoSuchCellError,
+    cell_settings,
+    clean_folder,
+    search_key,
+    settings_hash,
+    take_search,
+)
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral
 

@@ -18,10 +18,10 @@ from advnerf_core.report.cells import cell_from
 from advnerf_core.report.clips import ClipTrack, read_clip
 from nodes.experiment.pages.report import how_it_was_run
 from nodes.experiment.plan.cell import Cell
-from nodes.experiment.plan.maps_config import MapsConfig
 from nodes.experiment.plan.sections import RetrainConfig
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
+    MapsConfig,
     MeshShapeConfig,
     MeshTextureConfig,
     PlacesConfig,

@@ -20,6 +20,7 @@ from advnerf_core.geometry import Array
 from advnerf_core.report.clips import read_clip
 from hardware.worlds.junction.config import DubinsConfig
 from hardware.worlds.world import World
+from nodes.experiment.engine.run_folder import SEARCHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
@@ -31,7 +32,6 @@ from nodes.experiment.steps.attack import attack_problem, surrogate_part
 from nodes.experiment.steps.deploy import DRIVES, cell_data
 from nodes.experiment.steps.films import film_cell, filmed
 from nodes.experiment.steps.run import load_experiment
-from nodes.experiment.steps.search_files import SEARCHED
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
 SECONDS, TICKS_S = 2.0, (0.1, 0.01)

@@ -12,13 +12,13 @@ from advnerf_core.attack.search import textures
 from advnerf_core.fields.colour_grid import colour_grid
 from advnerf_core.report.evidence.hardness import FILE, HardnessError, read_hardness
 from benchmarks.victim_hardness import judge
+from nodes.experiment.engine.run_folder import SEARCHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.run.cells import search_cell
 from nodes.experiment.show.spaces import make_space
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem, from_measured_starts, past
-from nodes.experiment.steps.search_files import SEARCHED
 
 STARTS, TEXTURES = 3, 2
 

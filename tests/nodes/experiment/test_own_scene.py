@@ -14,15 +14,14 @@ from advnerf_core.policies.policy_file import save_policy
 from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.worlds.world import WorldError
+from nodes.experiment.engine.run_folder import ATTACK, FROZEN, SEARCHED
 from nodes.experiment.node.search import run_attack
 from nodes.experiment.run.cells import search_cell
 from nodes.experiment.run.whole import run_experiment
 from nodes.experiment.steps import bake
-from nodes.experiment.steps.keys import settings_hash
+from nodes.experiment.steps.keys import search_key, settings_hash
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment
-from nodes.experiment.steps.search_files import ATTACK, FROZEN, SEARCHED
-from nodes.experiment.steps.shared_search import search_key
 from nodes.runtime.progress import ProgressDisplay
 from tests.support.tiny_request import CALIBRATION, loaded, tiny_request
 

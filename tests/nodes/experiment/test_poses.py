@@ -7,9 +7,8 @@ from pydantic import ValidationError
 from advnerf_core.attack.spaces.placement import footprint
 from advnerf_core.geometry import rotation_z, yaw_of
 from hardware.worlds.junction.config import IntersectionConfig
-from nodes.experiment.plan.maps_config import LandscapeConfig, RobustnessMapConfig
 from nodes.experiment.plan.sections import PolicyConfig, RobustnessConfig
-from nodes.experiment.plan.space_config import PlacesConfig
+from nodes.experiment.plan.space_config import LandscapeConfig, PlacesConfig, RobustnessMapConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.spaces import bounds_of, lanes_of, random_placements
 
