@@ -104,8 +104,15 @@ def run_stages(
     whole = _read_whole(wanted, folder, reference)
     records: dict[str, Artefact] = {}
     for stage in wanted:
-        at = _Place(folder / stage.name, reference, stage.name in whole)
-        records[stage.name] = _run_or_reuse(stage, at, records, display)
+        if missing := [name for name in stage.after if name not in records]:
+            raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
+        at, key = _Place(folder / stage.name, reference, stage.name in whole), key_of(stage, records)
+        made = _finished(at, key, display)
+        if made is None:
+            with _lock(at.folder):
+                # The process that held the lock may have made exactly this.
+                made = _finished(at, key, display) or _go_on_or_begin(stage, at, key, records, display)
+        records[stage.name] = made
     return records
 
 
@@ -149,8 +156,7 @@ def outdated(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | 
         record = read_artefact(folder / stage.name)
         if record is None or record.digest is None:
             continue
-        known = (stage.settings, *stage.resumes_from) if all(name in records for name in stage.after) else ()
-        if record.key not in [key_of(replace(stage, settings=each), records) for each in known]:
+        if record.key not in _resumed(stage, records):
             found.append(stage.name)
     return found
 
@@ -160,12 +166,13 @@ def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Settings | N
     records = _current(stages, folder)
     stage = next(each for each in stages if each.name == name)
     record = read_artefact(folder / name)
-    if record is None or any(earlier not in records for earlier in stage.after):
-        return None
-    known = (stage.settings, *stage.resumes_from)
-    return next(
-        (each for each in known if record.key == key_of(replace(stage, settings=each), records)), None
-    )
+    return None if record is None else _resumed(stage, records).get(record.key)
+
+
+def _resumed(stage: Stage, records: Mapping[str, Artefact]) -> dict[str, Settings]:
+    """The settings of folders that running a stage goes on with, by their keys; none while stages that it builds on are not finished."""
+    known = (stage.settings, *stage.resumes_from) if all(name in records for name in stage.after) else ()
+    return {key_of(replace(stage, settings=each), records): each for each in known}
 
 
 def keep_stages(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild) -> list[Path]:
@@ -186,22 +193,6 @@ class _Place:
     folder: Path
     reference: ReferenceBuild | None
     whole: bool
-
-
-def _run_or_reuse(
-    stage: Stage, at: _Place, records: Mapping[str, Artefact], display: StageDisplay
-) -> Artefact:
-    missing = [name for name in stage.after if name not in records]
-    if missing:
-        raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
-    key = key_of(stage, records)
-    if (old := _finished(at, key, display)) is not None:
-        return old
-    with _lock(at.folder):
-        # The process that held the lock may have made exactly this.
-        if (old := _finished(at, key, display)) is not None:
-            return old
-        return _go_on_or_begin(stage, at, key, records, display)
 
 
 def _finished(at: _Place, key: str, display: StageDisplay) -> Artefact | None:
@@ -229,8 +220,7 @@ def _go_on_or_begin(
     stage: Stage, at: _Place, key: str, records: Mapping[str, Artefact], display: StageDisplay
 ) -> Artefact:
     folder, old = at.folder, read_artefact(at.folder)
-    parts = [key_of(replace(stage, settings=settings), records) for settings in stage.resumes_from]
-    resumed = old is not None and old.kept is None and old.key in (key, *parts)
+    resumed = old is not None and old.kept is None and old.key in _resumed(stage, records)
     if at.reference is not None and not at.whole and at.reference.find(stage.name, key) is not None:
         _require_ours(folder)
         if (taken := at.reference.take(stage.name, key, folder)) is not None:

@@ -101,7 +101,14 @@ def run_attack(
     chosen_method(experiment)  # before anything is loaded or written
     require_utf8(folder.absolute())
     experiment = replace(experiment, folder=folder.resolve())
-    keep_request(experiment)
+    kept, text = experiment.folder / REQUEST, request_text(experiment)
+    # One that failed to load is replaced.
+    if not kept.exists() or not is_begun(experiment.folder):
+        write_atomically(kept, text)
+    elif kept.read_text(encoding="utf-8") != text:
+        raise ConfigError(
+            f"{kept}: this folder belongs to another attack; resume it, or choose another folder"
+        )
     look_at_given(experiment)
     if experiment.config.attack.together:
         return _run_together(experiment, display, on_evaluation, on_prepared)
@@ -123,17 +130,6 @@ def run_attack(
 def attack_file(folder: Path, seed: int) -> Path:
     """Path of the attack file of a seed."""
     return folder / f"seed_{seed}.attack.safetensors"
-
-
-def keep_request(experiment: Experiment) -> None:
-    """Write a request into its folder. Another one in it is refused once its search has begun; one that failed to load is replaced."""
-    kept, text = experiment.folder / REQUEST, request_text(experiment)
-    if not kept.exists() or not is_begun(experiment.folder):
-        write_atomically(kept, text)
-    elif kept.read_text(encoding="utf-8") != text:
-        raise ConfigError(
-            f"{kept}: this folder belongs to another attack; resume it, or choose another folder"
-        )
 
 
 def kept_request(folder: Path) -> Experiment:

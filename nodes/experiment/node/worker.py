@@ -98,9 +98,8 @@ class Speaker:
         theta = self._best_theta(prepared)
         if theta is None:  # the method writes no state
             return
-        texture = _texture(prepared, theta)
-        if texture is not None:
-            self._image(TEXTURE, texture)
+        if (mount := prepared.space.mount) is not None:
+            self._image(TEXTURE, face_texture(prepared.space.attacked(theta)[mount.number].theta, 256))
         seen = prepared.problem.sensor.sense(prepared.problem.start_states[:1], theta).images
         pixels = tensor_to_images(seen)[0]
         self._image(PREVIEW, pixels.repeat(_PREVIEW_SCALE, 0).repeat(_PREVIEW_SCALE, 1))
@@ -134,13 +133,6 @@ def _so_far(state: Path) -> tuple[int, Evaluation | None]:
     entries = json.loads(read_tensors(state, "torch", ())[0].get("history", "[]"))
     history = [evaluation_from_json(entry) for entry in entries]
     return len(history), max(history, key=lambda each: each.value, default=None)
-
-
-def _texture(prepared: Prepared, theta: Tensor) -> NDArray[np.uint8] | None:
-    mount = prepared.space.mount
-    if mount is None:
-        return None
-    return face_texture(prepared.space.attacked(theta)[mount.number].theta, 256)
 
 
 def work(folder: Path, stream: BinaryIO) -> None:

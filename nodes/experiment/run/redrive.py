@@ -19,10 +19,10 @@ import numpy as np
 from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import KeptDrive, kept_drives
-from advnerf_core.report.evidence.kept_build import LOST, is_kept
+from advnerf_core.report.evidence.kept_build import LOST, VICTIM, is_kept
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.verifying.git import last_commit
-from nodes.experiment.engine.artefact import BUILD, VICTIM, Artefact, ReferenceBuild
+from nodes.experiment.engine.artefact import BUILD, Artefact, ReferenceBuild
 from nodes.experiment.engine.run_folder import ATTACK
 from nodes.experiment.engine.stages import key_of
 from nodes.experiment.plan.cell import Cell
@@ -75,14 +75,19 @@ def redrive(
     names = {file.stem for file in published.glob("*.json")}
     known = [cell for cell in experiment.cells if cell.name in names]
     chosen = random.Random(seed).sample(known, min(count, len(known)))
-    found = []
+    registration = read_registration(published)
+    found, registered = [], {} if registration is None else registration.scenarios
     for cell in chosen:
         tell(f"{cell.name}: driven again")
         said = read_cell(published / f"{cell.name}.json")
         variant = experiment.of(cell)
         look_at_given(variant)
         _take_stages(variant, said, ReferenceBuild(published.parent / BUILD))
-        _require_same_drives(variant, cell, published)
+        then, now = registered.get(cell.scenario), registered_scenario(variant, cell.path)
+        if differ := [
+            name for name in _DRIVEN if then is not None and getattr(then, name) != getattr(now, name)
+        ]:
+            raise unreadable(published, f"expected the {', '.join(differ)} that were registered, got others")
         again = _again(variant, cell.inside, attack_file(published, said.attack_id or NONE))
         found.append(_compared(cell.name, said.kept["surrogate"], again))
     return found
@@ -110,15 +115,6 @@ def unreadable(published: Path, why: str) -> RedriveError:
     commit = last_commit(published)
     of = f", git checkout {commit[:12]}" if commit else ""
     return RedriveError(f"{published.name}: {why}; drive it again with the version that published it{of}")
-
-
-def _require_same_drives(variant: Experiment, cell: Cell, published: Path) -> None:
-    """Raise if this version would drive differently from the registered drives."""
-    registration = read_registration(published)
-    then = None if registration is None else registration.scenarios.get(cell.scenario)
-    now = registered_scenario(variant, cell.path)
-    if differ := [name for name in _DRIVEN if then is not None and getattr(then, name) != getattr(now, name)]:
-        raise unreadable(published, f"expected the {', '.join(differ)} that were registered, got others")
 
 
 def _take_stages(experiment: Experiment, said: CellResult, build: ReferenceBuild) -> None:

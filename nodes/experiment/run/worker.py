@@ -16,7 +16,7 @@ import traceback
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TextIO
+from typing import Literal, NoReturn, TextIO
 
 from advnerf_core.files import write_atomically
 from advnerf_core.plugins import exit_refused, in_one_line, is_signal
@@ -230,8 +230,12 @@ def take_cell(store: Store, name: str) -> TextIO:
 
 def _checked(job: Job, store: Store) -> Experiment:
     """The current experiment, checked before the cell is touched."""
+    from advnerf_core.parallel import set_thread_count
+
     try:
-        _use_threads(job.threads)
+        set_thread_count(job.threads)
+        if "torch" in sys.modules:  # importing it takes seconds, and not every kind of cell needs it
+            sys.modules["torch"].set_num_threads(job.threads)
         whole = load_experiment(Path(job.file), job.setting, job.overrides, Path(job.folder))
         experiment = whole.of(job.cell)
         if settings_hash(experiment, job.cell.inside) != job.settings_hash:
@@ -293,24 +297,17 @@ def _add_seconds(work: Path, seconds: float) -> float:
     return total
 
 
-def _log_progress() -> Any:
-    said_s = [-_PROGRESS_PERIOD_S]
+def _log_progress() -> Report:
+    said_s = -_PROGRESS_PERIOD_S
 
     def report(fraction: float, text: str = "") -> None:
+        nonlocal said_s
         now_s = time.monotonic()
-        if now_s - said_s[0] >= _PROGRESS_PERIOD_S:
-            said_s[0] = now_s
+        if now_s - said_s >= _PROGRESS_PERIOD_S:
+            said_s = now_s
             print(f"{100 * fraction:.0f} % {text}", flush=True)
 
     return report
-
-
-def _use_threads(threads: int) -> None:
-    from advnerf_core.parallel import set_thread_count
-
-    set_thread_count(threads)
-    if "torch" in sys.modules:  # importing it takes seconds, and not every kind of cell needs it
-        sys.modules["torch"].set_num_threads(threads)
 
 
 def _die_with(parent: int) -> None:

@@ -20,7 +20,7 @@ from nodes.experiment.plan.carriers import FaceCarrier, ScreenConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.learned_scene import load_background
-from nodes.experiment.show.screen import cos_angle, face_picture, plain_picture, screens_of
+from nodes.experiment.show.screen import cos_angle, face_picture, screens_of
 from nodes.runtime.errors import ConfigError
 
 # The deployed face lies this far in front of the panel that carries it, so that it is never inside it.
@@ -105,8 +105,9 @@ def mean_cos_angle(experiment: Experiment) -> float:
 
 
 def plain_screen(experiment: Experiment) -> Rgb:
-    """Picture of the screen without an attack."""
-    return plain_picture(panel_of(experiment), wanted_face(experiment).plain_rgb)
+    """Picture of the screen without an attack: the face in one colour."""
+    colour = np.round(255.0 * np.asarray(wanted_face(experiment).plain_rgb))
+    return face_picture(panel_of(experiment), np.full((8, 8, 3), colour, np.uint8))
 
 
 class PaintedScene(Dressed):

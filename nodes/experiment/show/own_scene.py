@@ -54,9 +54,12 @@ def own_objects(experiment: Experiment) -> list[OwnObject]:
 
 
 def _own_object(experiment: Experiment, thing: PlacedObject) -> OwnObject:
+    space, wanted = experiment.config.space, thing.mesh
+    if wanted is None and isinstance(space, (MeshTextureConfig, MeshShapeConfig)):
+        wanted = MeshConfig(texels=space.texels)
     if thing.kind in FLAT:
         field: VoxelGridObject | MeshField = flat_object(experiment, thing)
-    elif (wanted := _as_mesh(experiment, thing)) is not None:
+    elif wanted is not None:
         field, file_sha256 = _mesh(thing, wanted)
         if file_sha256:
             return OwnObject(field, NamedObject(thing.name, hash_of([field.sha256, file_sha256])))
@@ -110,16 +113,9 @@ def _drawn(experiment: Experiment, thing: PlacedObject, marker_m: float, across:
     count = _resolution(experiment, face) + 2 * across
     at_m = (np.arange(count * _FINER) + 0.5) / (count * _FINER) * frame.sheet_m[0]
     inked = frame.drawn(at_m, at_m) / 255.0
-    display, _ = _display_of(face)
+    display, _ = display_of(face)
     seen = inked if display is None else display.forward(inked)
     return np.asarray(seen.reshape(count, _FINER, count, _FINER, 3).mean(axis=(1, 3)))
-
-
-def _as_mesh(experiment: Experiment, thing: PlacedObject) -> MeshConfig | None:
-    space = experiment.config.space
-    if thing.mesh is None and isinstance(space, (MeshTextureConfig, MeshShapeConfig)):
-        return MeshConfig(texels=space.texels)
-    return thing.mesh
 
 
 def _mesh(thing: PlacedObject, wanted: MeshConfig) -> tuple[MeshField, str]:
@@ -152,12 +148,8 @@ def mount_of(experiment: Experiment) -> FaceMount | None:
     return None
 
 
-def display_of(experiment: Experiment) -> tuple[DisplayModel | None, float]:
-    """The measured monitor or printer that shows the only object, and the cosine of a monitor's viewing angle; None without one."""
-    return _display_of(experiment.objects[0].face)
-
-
-def _display_of(face: FaceConfig | None) -> tuple[DisplayModel | None, float]:
+def display_of(face: FaceConfig | None) -> tuple[DisplayModel | None, float]:
+    """The measured monitor or printer that shows a face, and the cosine of a monitor's viewing angle; None without one."""
     if face is None or face.display is None:
         return None, 1.0
     return load_calibration(DisplayCalibration, face.display).display, face.display_cos

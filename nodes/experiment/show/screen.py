@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from advnerf_core.geometry import Array, invert_transform, transform_points
+from advnerf_core.geometry import Array, invert_transform, planar_pose, transform_points
 from calibration.display_colour import DisplayFit, colours_to_show, fit_display, mean_colour, screen_region
 from calibration.panel import MonitorPanel
 from hardware.worlds.world import Panel, Rgb, Screens, World
@@ -22,11 +22,6 @@ def face_picture(panel: Panel, texture: Rgb) -> Rgb:
     assert panel.screen_px is not None, "a board shows no pictures"
     pixels = MonitorPanel(panel.screen_px, (panel.width_m, panel.height_m))
     return pixels.picture(texture, (panel.square_m, panel.square_m))
-
-
-def plain_picture(panel: Panel, rgb: Sequence[float]) -> Rgb:
-    """The screen without an attack: the face in one colour (0..1)."""
-    return face_picture(panel, np.full((8, 8, 3), np.round(255.0 * np.asarray(rgb)), np.uint8))
 
 
 def screens_of(world: World) -> Screens:
@@ -65,7 +60,7 @@ def measure_display(
     shown, seen, cosines = [], [], []
     for angle in _ANGLES_RAD:
         car = _car_before(panel, world.T_car_from_camera, angle)
-        camera = np.array([*car[:2], 0.0]) + _turned(world.T_car_from_camera[:3, 3], car[2])
+        camera = transform_points(planar_pose(*car), world.T_car_from_camera[:3, 3])
         pictures = []
         for colour in colours:
             screens.show(name, np.full((2, 2, 3), colour, np.uint8))
@@ -89,8 +84,3 @@ def _car_before(panel: Panel, T_car_from_camera: Array, angle_rad: float) -> tup
         float(place[1] - ahead_m * math.sin(heading)),
         heading,
     )
-
-
-def _turned(offset: Array, yaw_rad: float) -> Array:
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    return np.array([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1], offset[2]])

@@ -10,7 +10,6 @@ import copy
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -61,7 +60,7 @@ def place_elsewhere(
     world = opened.enter_context(there.named_world.make())
     found = world.describe()
     if differ := [
-        name for name in _SAME if not _equal(getattr(found, name), getattr(experiment.world, name))
+        name for name in _SAME if not np.array_equal(getattr(found, name), getattr(experiment.world, name))
     ]:
         raise ConfigError(
             f"{experiment.file}: policy.learns_in: expected places with the {', '.join(_SAME)} of the attacked one, got other "
@@ -74,10 +73,6 @@ def place_elsewhere(
     except ConfigError as error:
         raise ConfigError(f"policy.learns_in: {' '.join(changes)}: {error}") from error
     return there, world
-
-
-def _equal(one: Any, other: Any) -> bool:
-    return bool(np.array_equal(one, other)) if isinstance(one, np.ndarray) else bool(one == other)
 
 
 def _plans(there: Experiment, world: World, place: str) -> list[SourcePlan]:

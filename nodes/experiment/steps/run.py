@@ -74,29 +74,21 @@ def _load(experiment: Experiment, document: Document) -> Experiment:
 def _check_world(experiment: Experiment, document: Document) -> None:
     """Raise for values that do not fit the world, with the line of the file."""
     read_world(document.part(("world",)), experiment.file.parent)
-    _check_ticks(experiment, document)
-    _check_objective(experiment, document)
-    _check_native(experiment, document)
-    if experiment.config.deploy.live:
-        check_live(experiment, document.place(("deploy",)))
-    if experiment.is_described:
-        _check_places(experiment, document)
-
-
-def _check_ticks(experiment: Experiment, document: Document) -> None:
-    """Check that a control tick is a whole number of the world's steps."""
+    # A control tick is a whole number of the world's steps.
     step_s, dt_s = experiment.traits.step_s, experiment.config.dt_s
     if step_s is not None and abs(round(dt_s / step_s) * step_s - dt_s) > _WHOLE_STEP_S:
         raise ConfigError(
             f"{document.place(('dt_s',))}: expected dt_s to be whole steps of the world {experiment.named_world.kind}, {step_s:g} s each, "
             f"got {dt_s:g} s"
         )
-
-
-def _check_objective(experiment: Experiment, document: Document) -> None:
-    """Check that the objective collision has a world with obstacles; users' objectives are checked before any stage."""
+    # Users' objectives are checked before any stage.
     if experiment.config.attack.objective == "collision" and experiment.solids is None:
         raise ConfigError(f"{document.place(('attack', 'objective'))}: {without_solids(experiment)}")
+    _check_native(experiment, document)
+    if experiment.config.deploy.live:
+        check_live(experiment, document.place(("deploy",)))
+    if experiment.is_described:
+        _check_places(experiment, document)
 
 
 def _check_native(experiment: Experiment, document: Document) -> None:
@@ -127,7 +119,13 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         if name not in experiment.world.paths:
             message = unknown(name, "path", experiment.world.paths)
             raise ConfigError(f"{document.place(('paths', index))}: paths: {message}")
-    _check_start_sigma(experiment, document)
+    # But for one in twenty, drawn starts are on the track.
+    sigma, limit_m = experiment.config.attack.start_sigma, experiment.world.off_track_m
+    if sigma > 0.5 * limit_m:
+        raise ConfigError(
+            f"{document.place(('attack', 'start_sigma'))}: expected attack.start_sigma to be at most half of the off-track limit, "
+            f"{limit_m:g} m, got {sigma:g}; with more, drives begin off the track"
+        )
     _check_start_poses(experiment, document)
     if experiment.config.own_scene or isinstance(experiment.named_world.make(), Photographed):
         _check_undriven(experiment, document)
@@ -146,16 +144,6 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         )
     if not given_in(experiment.config):  # existing policies are checked when the experiment is run
         _ = experiment.view
-
-
-def _check_start_sigma(experiment: Experiment, document: Document) -> None:
-    """Check that drawn starts are on the track, but for one in twenty."""
-    sigma, limit_m = experiment.config.attack.start_sigma, experiment.world.off_track_m
-    if sigma > 0.5 * limit_m:
-        raise ConfigError(
-            f"{document.place(('attack', 'start_sigma'))}: expected attack.start_sigma to be at most half of the off-track limit, "
-            f"{limit_m:g} m, got {sigma:g}; with more, drives begin off the track"
-        )
 
 
 def _check_start_poses(experiment: Experiment, document: Document) -> None:
