@@ -21,9 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont  # comes with matplotlib
 
 from advnerf_core.data.video import read_video
-from advnerf_core.report.conditions import style_of
+from advnerf_core.report.conditions import DARK, style_of
 from advnerf_core.report.data import Film
-from advnerf_core.report.palette import DARK
 
 MAX_BYTES = 1_500_000
 _QUALITIES = (24, 28, 32, 36, 40, 44)  # constant rate factors: larger is smaller and worse
@@ -133,21 +132,17 @@ def read_clip(path: Path) -> Frames:
     return np.stack([frame for *_, frame in read_video(path)])
 
 
-def film_uri(file: Path) -> str:
-    """A film, which `write_clip` wrote, as a data URI."""
-    return _data_uri("video/mp4", file.read_bytes())
-
-
 def image_uri(image: Frames, quality: int | None = None) -> str:
     """An RGB image as a data URI: PNG, or JPEG of the given quality."""
     kind, options = ("png", []) if quality is None else ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, quality])
     _, encoded = cv2.imencode(
         f".{kind}", cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), options
     )
-    return _data_uri(f"image/{kind}", encoded.tobytes())
+    return data_uri(f"image/{kind}", encoded.tobytes())
 
 
-def _data_uri(media_type: str, data: bytes) -> str:
+def data_uri(media_type: str, data: bytes) -> str:
+    """Content of a file as a data URI."""
     return f"data:{media_type};base64,{base64.b64encode(data).decode()}"
 
 

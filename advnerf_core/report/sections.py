@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from advnerf_core.report import maps, plots
-from advnerf_core.report.clips import Frames, image_uri
+from advnerf_core.report.clips import image_uri
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import SHOWN_VIEWS, Drives, ReportData
 from advnerf_core.report.pages import HOW, MAX_EMBEDDED_BYTES, fits, fragments
@@ -106,14 +106,13 @@ def _views(data: ReportData) -> list[dict[str, Any]]:
     out: list[dict[str, Any]] = []
     for view in data.fidelity.views if data.fidelity else ():
         if view.real is not None and view.surrogate is not None and len(out) < SHOWN_VIEWS:
-            images = view.real, view.surrogate, _difference(view.real, view.surrogate)
+            apart = np.abs(view.real.astype(np.int16) - view.surrogate.astype(np.int16)).mean(
+                axis=2, keepdims=True
+            )
+            apart = np.repeat(np.clip(_DIFFERENCE_GAIN * apart, 0, 255).astype(np.uint8), 3, axis=2)
+            images = view.real, view.surrogate, apart
             out.append({"view": view, "images": [image_uri(each) for each in images]})
     return out
-
-
-def _difference(a: Frames, b: Frames) -> Frames:
-    difference = np.abs(a.astype(np.int16) - b.astype(np.int16)).mean(axis=2, keepdims=True)
-    return np.repeat(np.clip(_DIFFERENCE_GAIN * difference, 0, 255).astype(np.uint8), 3, axis=2)
 
 
 def _fidelity_numbers(data: ReportData) -> Markup:

@@ -18,7 +18,6 @@ from pydantic import Field, ValidationError, model_validator
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_json
 from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.strict import StrictModel
 
@@ -175,11 +174,6 @@ def read_hardness(file: Path) -> HardnessRecord:
         ) from None
 
 
-def write_hardness(file: Path, record: HardnessRecord) -> None:
-    """Write a record of verdicts."""
-    write_json(file, record.model_dump(mode="json"))
-
-
 def merged(records: Iterable[HardnessRecord]) -> HardnessRecord:
     """One record of all verdicts.
 
@@ -214,10 +208,8 @@ def titles_of(folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
     baselines = {name for test in data["primary"] for name in test["test"]["against"]}
     names = {row["victim"] for row in data["rows"]}
 
-    def title(name: str) -> str:
-        return victim_title(name, map(read_cell, sorted(folder.glob("*.json"))), record, baselines)
-
-    return {name: title(name) for name in sorted(names)}
+    files = sorted(folder.glob("*.json"))
+    return {name: victim_title(name, map(read_cell, files), record, baselines) for name in sorted(names)}
 
 
 def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
@@ -22,7 +21,11 @@ def is_kept(folder: Path) -> bool:
     cells = registration.cells if (registration := read_registration(folder)) is not None else ()
     first = {(cell.scenario, cell.victim): cell.name for cell in reversed(cells)}
     files = [file for name in first.values() if (file := folder / f"{name}.json").exists()]
-    used = [digest for file in files for digest in _digests_of(read_json(file))]
+    used: list[str | None] = []
+    for cell in map(read_json, files):
+        # A victim with a recipe of its own has a stage of its own, policy-NAME; an existing one has no stage, and is there as its files.
+        stages = {name.partition("-")[0]: digest for name, digest in cell.get("stages", {}).items()}
+        used += [stages.get("scene"), stages.get("policy") or cell.get("policy_sha256")]
     return bool(used) and all(digest in kept for digest in used)
 
 
@@ -50,10 +53,3 @@ def _digest_in(record: Path) -> str | None:
         return read_json(record).get("digest")
     except (AdvnerfError, AttributeError):
         return None
-
-
-def _digests_of(cell: dict[str, Any]) -> tuple[str | None, str | None]:
-    """Digests of scene and victim; an existing victim has no stage, and is there as its files."""
-    # A victim with a recipe of its own has a stage of its own, policy-NAME.
-    stages = {name.partition("-")[0]: digest for name, digest in cell.get("stages", {}).items()}
-    return stages.get("scene"), stages.get("policy") or cell.get("policy_sha256")

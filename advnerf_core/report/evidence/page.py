@@ -123,7 +123,12 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
         _where(data["deployed_through"]),
         *data.get("notes", ()),
         *_withdrawn(data),
-        *_drives_badly(data),
+        # Victims that break the registered rule.
+        *(
+            f"**Does not drive well:** past the plain object, the victim {row['victim']} has a mean abs. CTE of {row['mean_cte_m']:.4f} m {row['domain']} in "
+            f"{place_of(row)}, and {row['off_track']} drives leave the track. Registered were at most {row['limit_m']:.4f} m, and none. {row['reason']}\n"
+            for row in data.get("does_not_drive_well", [])
+        ),
     ]
     if data["primary"]:
         apart = searched_apart(data["primary"])
@@ -250,15 +255,6 @@ def _withdrawn(data: Mapping[str, Any]) -> list[str]:
             f"p = 1 in Holm's adjustment. {reason}\n"
         )
     return sentences
-
-
-def _drives_badly(data: Mapping[str, Any]) -> list[str]:
-    """Sentences about victims that break the registered rule of driving well."""
-    return [
-        f"**Does not drive well:** past the plain object, the victim {row['victim']} has a mean abs. CTE of {row['mean_cte_m']:.4f} m {row['domain']} in "
-        f"{place_of(row)}, and {row['off_track']} drives leave the track. Registered were at most {row['limit_m']:.4f} m, and none. {row['reason']}\n"
-        for row in data.get("does_not_drive_well", [])
-    ]
 
 
 def _tests(tests: Sequence[Mapping[str, Any]]) -> str:

@@ -33,7 +33,7 @@ from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.report.conditions import EMPTY
 from hardware.worlds.world import World
 from nodes.experiment.engine.artefact import Settings, hash_of
-from nodes.experiment.engine.run_folder import ATTACK, SEARCHED
+from nodes.experiment.engine.run_folder import ATTACK, FROZEN, SEARCHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import keep_title
 from nodes.experiment.plan.space_config import (
@@ -43,12 +43,11 @@ from nodes.experiment.plan.space_config import (
     PlacesConfig,
 )
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import Dressed
-from nodes.experiment.show.drives import learned_drives, totals
+from nodes.experiment.show.deployed import Dressed, learned_drives, totals
 from nodes.experiment.show.learned_scene import baked_file, load_field, scene_sha256
 from nodes.experiment.show.spaces import dress, over_the_world, shown_there
 from nodes.experiment.show.victims import load_victim, told
-from nodes.experiment.steps.frozen import frozen_for, hardness_before
+from nodes.experiment.steps.frozen import frozen_for
 from nodes.experiment.steps.keys import registered_settings, search_key
 from nodes.runtime.errors import ConfigError
 
@@ -174,7 +173,8 @@ def surrogate_part(
     data = {
         "attack_id": attack_id,
         "policy_sha256": prepared.policy.sha256,
-        "hardness": hardness_before(folder),
+        # The victim's passing verdict when the search began.
+        "hardness": str(read_json(folder / FROZEN).get("hardness", "")) if (folder / FROZEN).exists() else "",
         **surrogate_drives(experiment, space, cell, folder),
         "curve_total_cte_m": curve,
         **values,
@@ -380,6 +380,21 @@ def telling(
 def attack_file(prepared: Prepared, result: SearchResult) -> AttackFile:
     """The attack file of a search's result; its prediction is made without disturbances."""
     experiment, space, problem = prepared.experiment, prepared.space, prepared.problem
+    extra = {
+        "experiment": experiment.config.name,
+        "victim": prepared.cell.victim,
+        "scenario": prepared.cell.scenario,
+        "horizon": experiment.searched_ticks,
+        "evaluations": len(result.history),
+        "start_states": problem.start_states[:, :3].tolist(),
+        "searched_space": experiment.config.space.model_dump(mode="json"),
+        **said_of_device(),
+        **objective_entry(
+            experiment.config.attack.objective, problem.objective, result.best.value, prepared.clean_value
+        ),
+    }
+    if identity := prepared.policy.metadata.get("not_fixed"):
+        extra["policy_not_fixed"] = identity
     attack = AttackFile(
         method=prepared.cell.method,
         space=space.name,
@@ -394,7 +409,7 @@ def attack_file(prepared: Prepared, result: SearchResult) -> AttackFile:
         seed=prepared.seed,
         predicted_total_cte_m=result.best.predicted_total_cte_m,
         software_version=version("advnerf"),
-        extra=_extra(prepared, result),
+        extra=extra,
         clean_drive=prepared.clean_drive,
     )
     if space.mount is not None:
@@ -414,24 +429,3 @@ def attack_file(prepared: Prepared, result: SearchResult) -> AttackFile:
         return attack
     _, totals_m = evaluate(past_field(experiment, problem.undisturbed(), space, shown), shown.colours)
     return replace(attack, field_total_cte_m=float(totals_m.protocol_cte_m.mean()))
-
-
-def _extra(prepared: Prepared, result: SearchResult) -> dict[str, Any]:
-    """Further data of an attack file beside its fields."""
-    experiment, problem = prepared.experiment, prepared.problem
-    found = {
-        "experiment": experiment.config.name,
-        "victim": prepared.cell.victim,
-        "scenario": prepared.cell.scenario,
-        "horizon": experiment.searched_ticks,
-        "evaluations": len(result.history),
-        "start_states": problem.start_states[:, :3].tolist(),
-        "searched_space": experiment.config.space.model_dump(mode="json"),
-        **said_of_device(),
-        **objective_entry(
-            experiment.config.attack.objective, problem.objective, result.best.value, prepared.clean_value
-        ),
-    }
-    if identity := prepared.policy.metadata.get("not_fixed"):
-        found["policy_not_fixed"] = identity
-    return found

@@ -18,8 +18,7 @@ from hardware.worlds.world import World
 from nodes.experiment.engine.run_folder import ATTACK, SEARCHED, THETA
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import DeployedDrive
-from nodes.experiment.show.drives import deployed_drives, totals
+from nodes.experiment.show.deployed import DeployedDrive, deployed_drives, totals
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import dress_cell
 from nodes.experiment.steps.live import LiveNodes, LiveRun, as_drive, drive_until_it_counts
@@ -121,8 +120,14 @@ def cell_data(
             "blocked_tick": driven["blocked_tick"],
             "max_abs_cte_m": max(driven["max_cte_m"]),
             "off_track_m": experiment.limits.off_track_m,
-            **_live_extra(driven["live"]),
         }
+        if live := driven["live"]:
+            data["extra"] |= {
+                "stopped_early": [each["outcome"]["stopped_early"] for each in live],
+                "missed_frames": [each["missed"] for each in live],
+                "spoiled_tries": [each["spoiled"] for each in live],
+                "time_to_leave_s": [each["metrics"]["time_to_leaving_s"] for each in live],
+            }
     return data
 
 
@@ -131,18 +136,6 @@ def _drives_of(found: Mapping[str, Any], without_m: Sequence[float]) -> dict[str
         "total_cte_m": found["total_cte_m"],
         "off_track": found["off_track"],
         "none_total_cte_m": list(without_m),
-    }
-
-
-def _live_extra(live: list[dict[str, Any]]) -> dict[str, Any]:
-    """Values that only live drives have, per start."""
-    if not live:
-        return {}
-    return {
-        "stopped_early": [each["outcome"]["stopped_early"] for each in live],
-        "missed_frames": [each["missed"] for each in live],
-        "spoiled_tries": [each["spoiled"] for each in live],
-        "time_to_leave_s": [each["metrics"]["time_to_leaving_s"] for each in live],
     }
 
 

@@ -139,11 +139,12 @@ def plans(
         ending: Suffix of the sources' names, which distinguishes their frames.
     """
     config = experiment.config.policy
-    domains = (
-        _face_domains(experiment, scene)
-        if has_face(experiment)
-        else _object_domains(experiment, scene, objects)
-    )
+    if has_face(experiment):  # the learned panel, or a face on it
+        space, seen = _seen_face(experiment)
+        painted = PaintedScene(experiment, scene, _TRAINING_TEXTURE_PX)
+        domains = _Domains(painted, seen, _any_face(experiment, space))
+    else:
+        domains = _object_domains(experiment, scene, objects)
     dressed, any_colours = domains.dressed, domains.any_colours
 
     def source(domain: str, name: str) -> FrameSource:
@@ -221,13 +222,6 @@ def surrogate_plan(experiment: Experiment) -> SourcePlan:
     source = RenderedSource("surrogate", seen, experiment.dynamics, _any_face(experiment, space))
     wanted = experiment.config.policy
     return SourcePlan(source, wanted.surrogate_stills, wanted.surrogate_drives, wanted.drive_steps)
-
-
-def _face_domains(experiment: Experiment, scene: World) -> _Domains:
-    """Domains with the learned panel, or with a face on it."""
-    space, seen = _seen_face(experiment)
-    dressed = PaintedScene(experiment, scene, _TRAINING_TEXTURE_PX)
-    return _Domains(dressed, seen, _any_face(experiment, space))
 
 
 def _any_face(experiment: Experiment, space: FaceSpace) -> Sample:

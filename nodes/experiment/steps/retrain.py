@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,7 @@ from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import Dressed
-from nodes.experiment.show.drives import deployed_drives
+from nodes.experiment.show.deployed import Dressed, deployed_drives
 from nodes.experiment.show.given import victim_spec
 from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import placed_objects
@@ -77,7 +77,8 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     require_same_steering(experiment)
     space = colour_space(experiment)
     main = experiment.config.main_victim
-    file, rounds, kept = Path(victim_spec(experiment, main)), [], _old_frames(experiment)
+    store = FrameStore(experiment.stage_folder(experiment.config.policy_stage(RETRAINED)) / "frames")
+    file, rounds, kept = Path(victim_spec(experiment, main)), [], [store.load(name) for name in store.names()]
     victim = load_policy(file)
     thetas: list[torch.Tensor] = []
     pays_m = pays_from_m(experiment)
@@ -124,7 +125,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
                     new,
                     settings,
                     file,
-                    _stepping(told, wanted.steps, experiment.car.control_unit),
+                    partial(_stepped, told, wanted.steps, experiment.car.control_unit),
                 )
             victim, kept = load_policy(file), [*kept, *new]
 
@@ -151,17 +152,8 @@ def _part(report: Report, begin: float, share: float, name: str) -> Told:
     return told
 
 
-def _stepping(told: Told, steps: int, unit: str) -> Callable[[int, float], None]:
-    def stepped(step: int, loss: float) -> None:
-        told(0.7 + 0.3 * step / steps, f"fine-tuning: error {loss**0.5:.3f} {unit}")
-
-    return stepped
-
-
-def _old_frames(experiment: Experiment) -> list[Frames]:
-    trained_in = experiment.config.policy_stage(RETRAINED)
-    store = FrameStore(experiment.stage_folder(trained_in) / "frames")
-    return [store.load(name) for name in store.names()]
+def _stepped(told: Told, steps: int, unit: str, step: int, loss: float) -> None:
+    told(0.7 + 0.3 * step / steps, f"fine-tuning: error {loss**0.5:.3f} {unit}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from datetime import datetime
-from typing import Any
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
-from advnerf_core.report.evidence.registration import RegisteredScenario, settings_differences
+from advnerf_core.report.evidence.registration import settings_differences
 from advnerf_core.report.evidence.results import Evidence
 
 
@@ -57,7 +56,12 @@ def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
             yield f"{cell.name}: expected {key} {value} as registered, got {found}"
     if bool(scenario.settings) > bool(cell.settings):
         yield f"{cell.name}: expected its settings, as the registration has them, got none"
-    registered = {**_settings_of(scenario, cell.victim), **scenario.pinned(cell.victim, cell.method)}
+    registered = {**scenario.settings, **scenario.pinned(cell.victim, cell.method)}
+    # A victim with a recipe of its own has its own training and architecture.
+    if (recipe := scenario.settings.get("recipes", {}).get(cell.victim)) is not None:
+        policy = {name: recipe[name] for name in scenario.settings["policy"]}
+        architecture = {name: value for name, value in recipe.items() if name not in policy}
+        registered |= {"policy": policy, "architecture": architecture}
     # Its policy is the one that drove, also in cells from before their settings were stored.
     for text in settings_differences(registered, {**cell.settings, "policy_sha256": cell.policy_sha256}):
         yield f"{cell.name}: expected the registered settings, got {text}"
@@ -71,16 +75,6 @@ def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
         is_older = True
     if is_older:
         yield f"{cell.name}: expected a date from {registered_on} on, when it was registered, got {cell.date}"
-
-
-def _settings_of(scenario: RegisteredScenario, victim: str) -> Mapping[str, Any]:
-    """The registered settings of a victim's cells: one with a recipe of its own has its own training and architecture."""
-    recipe = scenario.settings.get("recipes", {}).get(victim)
-    if recipe is None:
-        return scenario.settings
-    policy = {name: recipe[name] for name in scenario.settings["policy"]}
-    architecture = {name: value for name, value in recipe.items() if name not in policy}
-    return {**scenario.settings, "policy": policy, "architecture": architecture}
 
 
 def build_problems(evidence: Evidence) -> Iterator[str]:
