@@ -22,13 +22,17 @@ _DIFFERENCE_GAIN = 4
 
 def page_sections(data: ReportData, table: ResultTable) -> list[tuple[str, Markup]]:
     """Headings and HTML; parts that were not measured are named as such."""
+    seconds = data.manifest.timings
+    timings = [(name, number(wall_s, 1)) for name, wall_s in seconds.items()]
+    timings.append(("all stages", number(sum(seconds.values()), 1)))
+    stages = Table("Stages", ("stage", "wall time [s]"), tuple(timings), (False, True), (len(seconds),))
     drawn = fragments(
         "sections.html",
         data=data,
         image=lambda picture: image_uri(picture, quality=88),
         hops=_hop_table(data).html(),
         live_tries=_tries_table(table),
-        timings=_timing_table(data).html(),
+        timings=stages.html(),
         figures=_figures(data),
         textures=[(t, image_uri(t.image)) for t in data.textures],
         pairs_of_views=_views(data),
@@ -149,11 +153,3 @@ def _tries_table(table: ResultTable) -> Table:
         cells.append((*named, driven, str(len(spoiled)), "; ".join(spoiled)))
     columns = ("object shows", "policy", "seed", "driven live", "spoiled tries", "why they do not count")
     return Table("Live drives", columns, tuple(cells), (False, False, True, False, True, False))
-
-
-def _timing_table(data: ReportData) -> Table:
-    """Wall time of the stages and their sum."""
-    timings = data.manifest.timings
-    cells = [(name, number(wall_s, 1)) for name, wall_s in timings.items()]
-    cells.append(("all stages", number(sum(timings.values()), 1)))
-    return Table("Stages", ("stage", "wall time [s]"), tuple(cells), (False, True), (len(cells) - 1,))

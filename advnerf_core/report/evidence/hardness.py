@@ -198,8 +198,14 @@ def victim_title(
     if not any(verdict.passed for verdict in record.verdicts):
         return TRAINED_WITH_TEXTURES
     searched = [cell for cell in cells if cell.victim == victim and cell.method.startswith("gradient")]
-    judged = bool(searched) and all(_judged_before(cell, record, baselines) for cell in searched)
-    return HARDENED if judged else TRAINED_WITH_TEXTURES
+    for cell in searched:
+        # A verdict of its policy, on other families than the baselines, that existed before its search began.
+        verdict = record.passing(cell.policy_sha256)
+        if verdict is None or cell.extra.get("hardness") != verdict.digest:
+            return TRAINED_WITH_TEXTURES
+        if {*verdict.trained_on, *verdict.validated_on} & {*baselines}:
+            return TRAINED_WITH_TEXTURES
+    return HARDENED if searched else TRAINED_WITH_TEXTURES
 
 
 def titles_of(folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
@@ -223,11 +229,3 @@ def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
 
     found: dict[str, Any] = titled(data)
     return found
-
-
-def _judged_before(cell: CellResult, record: HardnessRecord, baselines: Collection[str]) -> bool:
-    """Whether a passing verdict of the cell's policy, on other families than the baselines, existed before its search began."""
-    verdict = record.passing(cell.policy_sha256)
-    if verdict is None or cell.extra.get("hardness") != verdict.digest:
-        return False
-    return not {*verdict.trained_on, *verdict.validated_on} & {*baselines}

@@ -230,18 +230,6 @@ def _go_on_or_begin(
         _require_ours(folder)
         shutil.rmtree(folder)
     earlier_s = old.seconds if resumed and old is not None else 0.0
-    return _run(stage, folder, key, earlier_s, display)
-
-
-def _require_ours(folder: Path) -> None:
-    """Raise instead of replacing files that no stage wrote."""
-    if folder.exists() and not (folder / RECORD).exists() and any(folder.iterdir()):
-        raise StageError(
-            f"expected {folder} to be a stage's folder, got files that no stage wrote; move them, or name another run folder"
-        )
-
-
-def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: StageDisplay) -> Artefact:
     folder.mkdir(parents=True, exist_ok=True)
     settings = stage.settings.resolved
     write_artefact(folder, Artefact(key, None, earlier_s, settings))
@@ -256,3 +244,11 @@ def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: StageD
     write_artefact(folder, record)
     display.finish(stage.name, record.seconds, cached=False)
     return record
+
+
+def _require_ours(folder: Path) -> None:
+    """Raise instead of replacing files that no stage wrote."""
+    if folder.exists() and not (folder / RECORD).exists() and any(folder.iterdir()):
+        raise StageError(
+            f"expected {folder} to be a stage's folder, got files that no stage wrote; move them, or name another run folder"
+        )

@@ -18,7 +18,7 @@ from nodes.experiment.node.prepare import prepare
 from nodes.experiment.plan.placed import FLAT
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.own_scene import flat_object
-from nodes.experiment.steps.attack import Prepared, past_field
+from nodes.experiment.steps.attack import past_field
 from nodes.runtime.errors import ConfigError
 
 # The squash has no inverse at 0 and 1.
@@ -86,11 +86,8 @@ def print_effect(
     parts[number] = torch.from_numpy(np.log(share / (1.0 - share))).to(found.colours.dtype)
     colours = parts[0] if len(parts) == 1 else torch.cat([part.reshape(-1, 3) for part in parts])
     shown = Shown(objects, colours)
-    clean_m, nominal_m, print_m = (_total_m(prepared, each) for each in (prepared.space.plain, found, shown))
-    return PrintEffect(clean_m, nominal_m, print_m, T_world_from_face is not None)
-
-
-def _total_m(prepared: Prepared, shown: Shown) -> float:
-    judged = past_field(prepared.experiment, prepared.problem.undisturbed(), prepared.space, shown)
-    _, totals = evaluate(judged, shown.colours)
-    return float(totals.protocol_cte_m.mean())
+    totals_m, problem = [], prepared.problem.undisturbed()
+    for each in (prepared.space.plain, found, shown):
+        _, totals = evaluate(past_field(request, problem, prepared.space, each), each.colours)
+        totals_m.append(float(totals.protocol_cte_m.mean()))
+    return PrintEffect(totals_m[0], totals_m[1], totals_m[2], T_world_from_face is not None)

@@ -30,8 +30,7 @@ from hardware.worlds.world import Overview, Rgb, World
 from nodes.experiment.engine.artefact import read_artefact
 from nodes.experiment.engine.run_folder import CELLS, SEARCHED
 from nodes.experiment.pages.gather import gather
-from nodes.experiment.pages.opening import Wording, first_screen
-from nodes.experiment.pages.table import wanted_rows, write_table
+from nodes.experiment.pages.table import Wording, first_screen, wanted_rows, write_table
 from nodes.experiment.plan.carriers import FaceCarrier
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import know_methods_of

@@ -155,7 +155,6 @@ def run_in_process(job: Job) -> Ended:
 
 def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, report: Report) -> Ended:
     """Run a cell in this process, which holds the lock of live graphs if it needs it; an error is stored, and other cells continue."""
-    began = time.monotonic()
     store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
     try:
         lock = hold(store.lock_file(job.name))
@@ -163,21 +162,30 @@ def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, repor
         return Ended(job.name, "elsewhere", f"{job.name} is being run by process {held.owner}", 0.0)
     with lock:
         work = _begin(job, store, experiment)
-        try:
-            with exit_refused():
-                _run(job, store, work, experiment, report, bench)
-        except _OF_INPUTS as error:
-            return Ended(job.name, "lost", in_one_line(error), time.monotonic() - began)
-        except Exception as error:
-            text = in_one_line(error)
-            store.keep_error(job.name, job.settings_hash, text)
-            (work / LOG).write_text(traceback.format_exc(), encoding="utf-8")
-            return Ended(job.name, "failed", text, time.monotonic() - began)
-    return Ended(job.name, "done", _not_driven(job, store), time.monotonic() - began)
+        return _attempt(job, store, work, experiment, report, bench)
 
 
 def _begin(job: Job, store: Store, experiment: Experiment) -> Path:
     return store.begin(job.name, job.settings_hash, cell_settings(experiment, job.cell.inside))
+
+
+def _attempt(
+    job: Job, store: Store, work: Path, experiment: Experiment, report: Report, bench: Bench | None = None
+) -> Ended:
+    """Run a cell that is locked; an error is stored, and where it came from is added to the cell's log."""
+    began = time.monotonic()
+    try:
+        with exit_refused():
+            _run(job, store, work, experiment, report, bench)
+    except _OF_INPUTS as error:
+        return Ended(job.name, "lost", in_one_line(error), time.monotonic() - began)
+    except Exception as error:
+        text = in_one_line(error)
+        store.keep_error(job.name, job.settings_hash, text)
+        with open(work / LOG, "a", encoding="utf-8") as log:
+            traceback.print_exc(file=log)
+        return Ended(job.name, "failed", text, time.monotonic() - began)
+    return Ended(job.name, "done", _not_driven(job, store), time.monotonic() - began)
 
 
 def _not_driven(job: Job, store: Store) -> str:
@@ -204,15 +212,11 @@ def _run_job() -> None:
         work = _begin(job, store, experiment)
         with open(work / LOG, "a", encoding="utf-8", buffering=1) as log:
             os.dup2(log.fileno(), 1)
-            try:
-                with exit_refused():
-                    _run(job, store, work, experiment, _log_progress())
-            except _OF_INPUTS as error:
-                _end_changed(error)
-            except Exception as error:
-                traceback.print_exc(file=log)
-                store.keep_error(job.name, job.settings_hash, in_one_line(error))
-                raise SystemExit(_FAILED) from None
+        ended = _attempt(job, store, work, experiment, _log_progress())
+    if ended.how == "lost":
+        _end_changed(ended.text)
+    if ended.how == "failed":
+        raise SystemExit(_FAILED)
 
 
 def take_cell(store: Store, name: str) -> TextIO:
@@ -243,15 +247,15 @@ def _checked(job: Job, store: Store) -> Experiment:
                 f"{job.name}: its settings or inputs changed after the experiment was started; run it again"
             )
     except _OF_INPUTS as error:
-        _end_changed(error)
+        _end_changed(in_one_line(error))
     except Exception as error:
         store.keep_error(job.name, job.settings_hash, in_one_line(error))
         raise SystemExit(_FAILED) from None
     return experiment
 
 
-def _end_changed(error: Exception) -> NoReturn:
-    print(in_one_line(error), file=sys.stderr)
+def _end_changed(text: str) -> NoReturn:
+    print(text, file=sys.stderr)
     raise SystemExit(_CHANGED) from None
 
 

@@ -298,7 +298,10 @@ def deployed_drives(
     report: Callable[[int], None] = lambda done: None,
 ) -> list[DeployedDrive]:
     """Drives through the deployment scene from starts ``[B, 3]``, with its own car or an ideal one; ``report`` gets the number of finished ones."""
-    effects, car, found = experiment.config.deploy.camera, _car(experiment, dressed), []
+    effects, found = experiment.config.deploy.camera, []
+    car: SelfDriving | IdealDriving = IdealDriving(experiment.dynamics, experiment.world.fence_m)
+    if experiment.config.deploy.car == "own":
+        car = SelfDriving(dressed.scene, experiment.car.speed_mps, experiment.limits.dt_s)
     for number, start in enumerate(starts.numpy()):
         driven = drive_deployed(
             dressed,
@@ -314,12 +317,6 @@ def deployed_drives(
         found.append(driven)
         report(len(found))
     return found
-
-
-def _car(experiment: Experiment, dressed: Dressed) -> SelfDriving | IdealDriving:
-    if experiment.config.deploy.car == "ideal":
-        return IdealDriving(experiment.dynamics, experiment.world.fence_m)
-    return SelfDriving(dressed.scene, experiment.car.speed_mps, experiment.limits.dt_s)
 
 
 def totals(scores: Sequence[DriveMetrics]) -> dict[str, Any]:

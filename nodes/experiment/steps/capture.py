@@ -17,11 +17,18 @@ from calibration.schema import save_calibration
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.world import Photograph, Photographed, World
 from nodes.experiment.show.context import CALIBRATION, PLACED, Experiment
-from nodes.experiment.show.faces import DISPLAY, on_screen, panel_of, plain_screen, wanted_face
+from nodes.experiment.show.faces import (
+    DISPLAY,
+    measure_display,
+    on_screen,
+    panel_of,
+    plain_screen,
+    screens_of,
+    wanted_face,
+)
 from nodes.experiment.show.learned_scene import HELD_OUT
 from nodes.experiment.show.light import LIGHT, light_remark, measure_light
 from nodes.experiment.show.placing import place_by_rule
-from nodes.experiment.show.screen import measure_display, screens_of
 from nodes.runtime.progress import Report, counted
 
 PHOTOS, COLOUR_PAIRS = "photos", "colour_pairs"

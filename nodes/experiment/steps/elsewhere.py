@@ -15,7 +15,7 @@ import numpy as np
 
 from advnerf_core.documents import Document
 from advnerf_core.learning.recipe import SourcePlan
-from advnerf_core.learning.sources import RenderedSource
+from advnerf_core.learning.sources import FrameSource, RenderedSource
 from hardware.worlds.world import World
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import seen_in
@@ -95,16 +95,21 @@ def _plans(there: Experiment, world: World, place: str) -> list[SourcePlan]:
             ),
         )
         for which, source in enumerate(sources):
-            found.append(
-                SourcePlan(
-                    source,
-                    (wanted.deployed_stills + which) // 2,
-                    (wanted.deployed_drives + which) // 2,
-                    wanted.drive_steps,
-                    goal=there.goal(name),
-                    expert=there.expert(name),
-                    driven_m=wanted.driven_m,
-                    drives_from_m=wanted.drives_from_m,
-                )
-            )
+            halves = (wanted.deployed_stills + which) // 2, (wanted.deployed_drives + which) // 2
+            found.append(plan_of(there, name, source, *halves))
     return found
+
+
+def plan_of(experiment: Experiment, path: str, source: FrameSource, stills: int, drives: int) -> SourcePlan:
+    """So many frames of a source along a path, with its goal and its teacher."""
+    wanted = experiment.config.policy
+    return SourcePlan(
+        source,
+        stills,
+        drives,
+        wanted.drive_steps,
+        goal=experiment.goal(path),
+        expert=experiment.expert(path),
+        driven_m=wanted.driven_m,
+        drives_from_m=wanted.drives_from_m,
+    )

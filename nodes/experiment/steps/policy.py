@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -43,7 +42,7 @@ from nodes.experiment.show.objects import (
 )
 from nodes.experiment.show.victims import told
 from nodes.experiment.steps import capture
-from nodes.experiment.steps.elsewhere import plans_elsewhere
+from nodes.experiment.steps.elsewhere import plan_of, plans_elsewhere
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import MeasuringReport, Point
 
@@ -158,19 +157,12 @@ def plans(
 
     found = []
     for name in experiment.config.paths:
-        common: dict[str, Any] = {
-            "drive_steps": config.drive_steps,
-            "goal": experiment.goal(name),
-            "expert": experiment.expert(name),
-            "driven_m": config.driven_m,
-            "drives_from_m": config.drives_from_m,
-        }
         amounts = (
             ("deployed", config.deployed_stills, config.deployed_drives),
             ("surrogate", config.surrogate_stills, config.surrogate_drives),
         )
         for domain, stills, drives in amounts:
-            found.append(SourcePlan(source(domain, name), stills, drives, **common))
+            found.append(plan_of(experiment, name, source(domain, name), stills, drives))
     return found
 
 

@@ -20,9 +20,8 @@ from nodes.experiment.plan.object_kinds import PANEL
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.experiment_world import NotCapturedError
+from nodes.experiment.show.experiment_world import NotCapturedError, WorldUnknownError, is_users, keep_worlds
 from nodes.experiment.show.given import VictimUnknownError, given_in, victim_spec
-from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_worlds
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.keys import without_solids
 from nodes.experiment.steps.live import check_live
