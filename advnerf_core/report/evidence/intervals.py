@@ -93,8 +93,13 @@ def clustered_interval(
     if not 0.0 < level < 1.0:
         raise ValueError(f"expected a level within 0..1, got {level}; pass 0.95 for 95 %")
     rows = _rows(values, shared_starts)
-    found = _estimate_of(rows, shared_starts)
-    return _interval(*found, level) if found else None
+    if len(rows) == 1:
+        return _interval(one_sample(rows[0]), "starts", level) if rows[0].size > 1 else None
+    if not shared_starts:
+        return _interval(one_sample(np.array([row.mean() for row in rows])), "searches and starts", level)
+    if rows[0].size == 1:
+        return _interval(one_sample(np.concatenate(rows)), "searches", level)
+    return _interval(crossed(np.stack(rows)), "searches and starts", level)
 
 
 def difference_interval(one: ArrayLike, other: ArrayLike, level: float = LEVEL) -> ClusteredInterval | None:
@@ -140,17 +145,6 @@ def _rows(values: Iterable[ArrayLike], shared_starts: bool) -> list[Floats]:
             "all have, or pass shared_starts=False if each search has its own"
         )
     return rows
-
-
-def _estimate_of(rows: list[Floats], shared_starts: bool) -> tuple[MeanEstimate, Over] | None:
-    """Estimate the mean, and name the population of its standard error."""
-    if len(rows) == 1:
-        return (one_sample(rows[0]), "starts") if rows[0].size > 1 else None
-    if not shared_starts:
-        return one_sample(np.array([row.mean() for row in rows])), "searches and starts"
-    if rows[0].size == 1:
-        return one_sample(np.concatenate(rows)), "searches"
-    return crossed(np.stack(rows)), "searches and starts"
 
 
 def _interval(estimate: MeanEstimate, over: Over, level: float) -> ClusteredInterval:

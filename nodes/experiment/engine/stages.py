@@ -106,12 +106,14 @@ def run_stages(
     for stage in wanted:
         if missing := [name for name in stage.after if name not in records]:
             raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
-        at, key = _Place(folder / stage.name, reference, stage.name in whole), key_of(stage, records)
-        made = _finished(at, key, display)
+        at, key, is_whole = folder / stage.name, key_of(stage, records), stage.name in whole
+        made = _finished(at, key, is_whole, display)
         if made is None:
-            with _lock(at.folder):
-                # The process that held the lock may have made exactly this.
-                made = _finished(at, key, display) or _go_on_or_begin(stage, at, key, records, display)
+            with _lock(at):
+                # The process that held the lock may have made exactly this. A reference build lacks intermediate files.
+                made = _finished(at, key, is_whole, display) or _go_on_or_begin(
+                    stage, at, key, records, display, None if is_whole else reference
+                )
         records[stage.name] = made
     return records
 
@@ -186,22 +188,14 @@ def keep_stages(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild
     return [each for each in found if each is not None]
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Folder of a stage, a further place of its result, and whether its intermediate files are needed too."""
-
-    folder: Path
-    reference: ReferenceBuild | None
-    whole: bool
-
-
-def _finished(at: _Place, key: str, display: StageDisplay) -> Artefact | None:
-    record = read_artefact(at.folder)
+def _finished(folder: Path, key: str, whole: bool, display: StageDisplay) -> Artefact | None:
+    """The record of a folder with this key, finished; if its intermediate files are needed too, with these."""
+    record = read_artefact(folder)
     if record is None or record.key != key or record.digest is None:
         return None
-    if at.whole and record.kept is not None:
+    if whole and record.kept is not None:
         return None
-    display.finish(at.folder.name, record.seconds, cached=True)
+    display.finish(folder.name, record.seconds, cached=True)
     return record
 
 
@@ -217,13 +211,18 @@ def _lock(folder: Path) -> TextIO:
 
 
 def _go_on_or_begin(
-    stage: Stage, at: _Place, key: str, records: Mapping[str, Artefact], display: StageDisplay
+    stage: Stage,
+    folder: Path,
+    key: str,
+    records: Mapping[str, Artefact],
+    display: StageDisplay,
+    reference: ReferenceBuild | None,
 ) -> Artefact:
-    folder, old = at.folder, read_artefact(at.folder)
+    old = read_artefact(folder)
     resumed = old is not None and old.kept is None and old.key in _resumed(stage, records)
-    if at.reference is not None and not at.whole and at.reference.find(stage.name, key) is not None:
+    if reference is not None and reference.find(stage.name, key) is not None:
         _require_ours(folder)
-        if (taken := at.reference.take(stage.name, key, folder)) is not None:
+        if (taken := reference.take(stage.name, key, folder)) is not None:
             display.finish(stage.name, taken.seconds, cached=True)
             return taken
     if not resumed and folder.exists():

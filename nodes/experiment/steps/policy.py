@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -141,15 +141,14 @@ def plans(
     if has_face(experiment):  # the learned panel, or a face on it
         space, seen = _seen_face(experiment)
         painted = PaintedScene(experiment, scene, _TRAINING_TEXTURE_PX)
-        domains = _Domains(painted, seen, _any_face(experiment, space))
+        dressed, seen_in_surrogate, any_colours = _Domains(painted, seen, _any_face(experiment, space))
     else:
-        domains = _object_domains(experiment, scene, objects)
-    dressed, any_colours = domains.dressed, domains.any_colours
+        dressed, seen_in_surrogate, any_colours = _object_domains(experiment, scene, objects)
 
     def source(domain: str, name: str) -> FrameSource:
         called, drawn = f"{domain}-{name}{ending}", sample or any_colours
         if domain == "surrogate":
-            return RenderedSource(called, domains.seen_in_surrogate, experiment.dynamics, drawn)
+            return RenderedSource(called, seen_in_surrogate, experiment.dynamics, drawn)
         if config.own_car:
             speed_mps, dt_s = experiment.car.speed_mps, experiment.config.dt_s
             return SceneSource(called, scene, experiment.view, speed_mps, dt_s, dressed.paint, drawn)
@@ -166,8 +165,7 @@ def plans(
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class _Domains:
+class _Domains(NamedTuple):
     """Sources of frames: the attacked deployment scene, and the surrogate with the objects plain (None) or in any colours."""
 
     dressed: Dressed
