@@ -169,7 +169,14 @@ def maps_of(data: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
     if data["primary"]:
         return [[test] for test in searched_apart(data["primary"])]
     if not data.get("claims"):
-        return [[condition] for condition in _conditions(data)]
+        # In the form of tests, each with the difference to the one before.
+        found = dict[str, Mapping[str, Any]]()
+        for row in data.get("contrasts", ()):
+            of_row = {"victim": row["victim"], "method": row["method"]}
+            for end, difference_m in (("before", 0.0), ("after", row["difference_m"])):
+                test = {"scenario": row[end], **of_row}
+                found.setdefault(row[end], {"test": test, "baseline": None, "difference_m": difference_m})
+        return [[condition] for condition in found.values()]
     maps = dict[str, list[Mapping[str, Any]]]()
     for claimed in data.get("claims", ()):
         for each in claimed["each"]:
@@ -181,17 +188,6 @@ def maps_of(data: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
 def has_stills(data: Mapping[str, Any]) -> bool:
     """Whether the picture of a set has one map beside stills of its film, instead of each of `maps_of`: its tests share their searches."""
     return bool(data["primary"]) and len(maps_of(data)) == 1
-
-
-def _conditions(data: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The conditions that contrasts compare, in the form of tests, each with the difference to the one before."""
-    found = dict[str, Mapping[str, Any]]()
-    for row in data.get("contrasts", ()):
-        of_row = {"victim": row["victim"], "method": row["method"]}
-        for end, difference_m in (("before", 0.0), ("after", row["difference_m"])):
-            test = {"scenario": row[end], **of_row}
-            found.setdefault(row[end], {"test": test, "baseline": None, "difference_m": difference_m})
-    return list(found.values())
 
 
 def filmed_of(data: Mapping[str, Any]) -> Mapping[str, Any]:

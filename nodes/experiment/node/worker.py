@@ -55,7 +55,12 @@ class Speaker:
 
     def prepared(self, prepared: Prepared) -> None:
         """A seed is ready to be searched."""
-        done, self._best = _so_far(self._state(prepared))
+        # Of an interrupted search.
+        state, entries = self._state(prepared), "[]"
+        if state.exists():
+            entries = read_tensors(state, "torch", ())[0].get("history", "[]")
+        history = [evaluation_from_json(entry) for entry in json.loads(entries)]
+        done, self._best = len(history), max(history, key=lambda each: each.value, default=None)
         self._prepared, self._evaluations = prepared, planned_evaluations(prepared)
         self.say(
             "progress",
@@ -124,15 +129,6 @@ class Speaker:
     def _image(self, name: str, pixels: NDArray[np.uint8]) -> None:
         height, width = pixels.shape[:2]
         self.say("image", np.ascontiguousarray(pixels).tobytes(), name=name, height=height, width=width)
-
-
-def _so_far(state: Path) -> tuple[int, Evaluation | None]:
-    """Number of evaluations of an interrupted search, and the best of them."""
-    if not state.exists():
-        return 0, None
-    entries = json.loads(read_tensors(state, "torch", ())[0].get("history", "[]"))
-    history = [evaluation_from_json(entry) for entry in entries]
-    return len(history), max(history, key=lambda each: each.value, default=None)
 
 
 def work(folder: Path, stream: BinaryIO) -> None:

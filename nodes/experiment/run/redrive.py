@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from advnerf_core.report.cells import CellResult, read_cell
+from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import KeptDrive, kept_drives
 from advnerf_core.report.evidence.kept_build import LOST, VICTIM, is_kept
@@ -82,7 +82,15 @@ def redrive(
         said = read_cell(published / f"{cell.name}.json")
         variant = experiment.of(cell)
         look_at_given(variant)
-        _take_stages(variant, said, ReferenceBuild(published.parent / BUILD))
+        # Its stages, as if this version had made them.
+        build, records = ReferenceBuild(published.parent / BUILD), dict[str, Artefact]()
+        for stage in stages_of(variant):
+            if stage.name in said.stages:
+                key, folder = key_of(stage, records), variant.stage_folder(stage.name)
+                taken = build.take_digest(stage.name, said.stages[stage.name], key, folder)
+                if taken is None:
+                    raise RedriveError(f"{said.name} {LOST}")
+                records[stage.name] = taken
         then, now = registered.get(cell.scenario), registered_scenario(variant, cell.path)
         if differ := [
             name for name in _DRIVEN if then is not None and getattr(then, name) != getattr(now, name)
@@ -115,18 +123,6 @@ def unreadable(published: Path, why: str) -> RedriveError:
     commit = last_commit(published)
     of = f", git checkout {commit[:12]}" if commit else ""
     return RedriveError(f"{published.name}: {why}; drive it again with the version that published it{of}")
-
-
-def _take_stages(experiment: Experiment, said: CellResult, build: ReferenceBuild) -> None:
-    """Put the stages of a published cell into the run folder, as if this version had made them."""
-    records: dict[str, Artefact] = {}
-    for stage in stages_of(experiment):
-        if stage.name in said.stages:
-            key, folder = key_of(stage, records), experiment.stage_folder(stage.name)
-            found = build.take_digest(stage.name, said.stages[stage.name], key, folder)
-            if found is None:
-                raise RedriveError(f"{said.name} {LOST}")
-            records[stage.name] = found
 
 
 def _again(experiment: Experiment, cell: Cell, attack: Path) -> list[KeptDrive]:

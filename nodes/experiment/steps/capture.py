@@ -43,7 +43,11 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     with experiment.open_world() as scene:
         experiment.keep_world(scene)
         if isinstance(scene, Photographed):
-            _take_over(scene, config.held_out, folder, report)
+            # A place that is known by photographs: both sets are imported.
+            learned, views = scene.photographs(config.held_out)
+            total = len(learned) + len(views)
+            _write(folder / PHOTOS, learned, counted(report, PHOTOS, len(learned), 0, total))
+            _write(folder / HELD_OUT, views, counted(report, HELD_OUT, len(views), len(learned), total))
             return
         if experiment.has_rules:
             report(0.0, "placing objects")
@@ -72,14 +76,6 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         ):
             if count:
                 _driving_views(experiment, scene, name, count, rng, done, folder, report)
-
-
-def _take_over(place: Photographed, held_out: int, folder: Path, report: Report) -> None:
-    """Import both sets of a place that is known by photographs."""
-    learned, views = place.photographs(held_out)
-    total = len(learned) + len(views)
-    _write(folder / PHOTOS, learned, counted(report, PHOTOS, len(learned), 0, total))
-    _write(folder / HELD_OUT, views, counted(report, HELD_OUT, len(views), len(learned), total))
 
 
 def _write(folder: Path, photographs: Sequence[Photograph], told: Callable[[int], None]) -> None:

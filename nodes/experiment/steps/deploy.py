@@ -36,20 +36,6 @@ def drive_through_world(
     return deployed_drives(experiment, dressed, policy, cell.scenario, starts, colours)
 
 
-def _through_nodes(
-    experiment: Experiment, nodes: LiveNodes, cell: Cell, folder: Path, tell: Callable[[str], None]
-) -> list[dict[str, Any]]:
-    """Measurements of one live drive per start, each with the folder of its bag."""
-    attack = None if cell.method == NONE else (folder / ATTACK).resolve()
-    found = []
-    for number, start in enumerate(deployed_starts(experiment, cell).tolist()):
-        name = live_name(number)
-        live = LiveRun(name, cell.victim, cell.scenario, (start[0], start[1], start[2]), attack)
-        driven = drive_until_it_counts(experiment, live, folder, tell, nodes)
-        found.append({"run": name, **driven})
-    return found
-
-
 def live_name(start: int) -> str:
     """Name of the live run of a cell from one of its starts, in the cell's folder."""
     return f"live{start}"
@@ -154,7 +140,11 @@ def _deployed_part(
         return found
     live: list[dict[str, Any]] = []
     if isinstance(place, LiveNodes):
-        live = _through_nodes(experiment, place, cell, folder, tell)
+        attack = None if cell.method == NONE else (folder / ATTACK).resolve()
+        for number, (x_m, y_m, yaw_rad) in enumerate(deployed_starts(experiment, cell).tolist()):
+            wanted = LiveRun(live_name(number), cell.victim, cell.scenario, (x_m, y_m, yaw_rad), attack)
+            driven = drive_until_it_counts(experiment, wanted, folder, tell, place)
+            live.append({"run": wanted.name, **driven})
         drives = [as_drive(experiment, each) for each in live]
     else:
         drives = drive_through_world(experiment, place, space, cell, folder)

@@ -172,7 +172,11 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path, nodes: LiveN
     last_frame_ns = outcome.end_real_ns - round(horizon.dt_s * NS_PER_S)
     times = timing(bag, outcome.start_real_ns, last_frame_ns)
     drawn = sorted(attack_ids(bag))
-    _check_drawn(live, bag, drawn)
+    expected = [load_attack(live.attack).attack_id] if live.attack is not None else []
+    if drawn != expected:
+        raise RuntimeFault(
+            f"expected the attacks {expected} in the frames of run {live.name}, got {drawn}: {why_not_shown(bag)}"
+        )
     result: dict[str, Any] = {
         "victim": live.victim,
         "attack_ids": drawn,
@@ -256,11 +260,3 @@ def _horizon(experiment: Experiment, live: LiveRun) -> Horizon:
     """Control ticks over which a run is measured."""
     limits = experiment.limits
     return limits if live.ticks is None else replace(limits, ticks=live.ticks)
-
-
-def _check_drawn(live: LiveRun, bag: Path, drawn: list[str]) -> None:
-    expected = [load_attack(live.attack).attack_id] if live.attack is not None else []
-    if drawn != expected:
-        raise RuntimeFault(
-            f"expected the attacks {expected} in the frames of run {live.name}, got {drawn}: {why_not_shown(bag)}"
-        )

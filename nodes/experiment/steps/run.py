@@ -135,7 +135,16 @@ def _check_places(experiment: Experiment, document: Document) -> None:
     if not experiment.config.own_scene and (found := in_a_lane(experiment.placed_by_hand, experiment.world)):
         raise ConfigError(f"{document.place(('objects', by_hand[found[0]]))}: {found[1]}")
     if isinstance(carrier := experiment.config.carrier, FaceCarrier):
-        _check_panel(carrier, experiment, document)
+        panels = experiment.world.panels
+        if carrier.panel not in panels:
+            message = unknown(carrier.panel, "panel", panels)
+            raise ConfigError(f"{document.place(('carrier', 'panel'))}: carrier.panel: {message}")
+        has_screen = panels[carrier.panel].screen_px is not None
+        if has_screen != isinstance(carrier, ScreenConfig):
+            raise ConfigError(
+                f"{document.place(('carrier', 'kind'))}: expected carrier.kind {'screen' if has_screen else 'overlay'} with the panel "
+                f"{carrier.panel}, which is {'a' if has_screen else 'no'} screen, got {carrier.kind}"
+            )
     if experiment.traits.own_photo_colours and not experiment.config.capture.colour_pairs:
         raise ConfigError(
             f"{document.place(('capture',))}: expected capture.colour_pairs of at least 1, as the photographs of the world "
@@ -156,20 +165,6 @@ def _check_start_poses(experiment: Experiment, document: Document) -> None:
                     f"{document.place(('attack', 'start_poses', index))}: expected attack.start_poses on the track, at most {limit_m:g} m from the "
                     f"middle of the path {name}, got x = {x_m:g} m, y = {y_m:g} m, which is {abs(cte_m):.2f} m from it; give them in metres, as the path"
                 )
-
-
-def _check_panel(carrier: FaceCarrier, experiment: Experiment, document: Document) -> None:
-    """Check that the panel of a face exists in the world, and is a screen exactly if a screen shows the face."""
-    panels = experiment.world.panels
-    if carrier.panel not in panels:
-        message = unknown(carrier.panel, "panel", panels)
-        raise ConfigError(f"{document.place(('carrier', 'panel'))}: carrier.panel: {message}")
-    has_screen = panels[carrier.panel].screen_px is not None
-    if has_screen != isinstance(carrier, ScreenConfig):
-        raise ConfigError(
-            f"{document.place(('carrier', 'kind'))}: expected carrier.kind {'screen' if has_screen else 'overlay'} with the panel "
-            f"{carrier.panel}, which is {'a' if has_screen else 'no'} screen, got {carrier.kind}"
-        )
 
 
 def _check_undriven(experiment: Experiment, document: Document) -> None:
