@@ -181,23 +181,14 @@ def _panel(track: ClipTrack, step: int, rate_hz: float, off_track_m: float) -> F
     # Captions go on top: a player puts its controls over the bottom.
     canvas.paste(Image.fromarray(image), (0, _TITLE_PX + _STATUS_PX))
     cte = float(np.asarray(track.cte_m)[index])
-    _draw_title(canvas, track)
+    draw, middle = ImageDraw.Draw(canvas), _TITLE_PX / 2 - 1
+    draw.rectangle((0, 0, 4, _TITLE_PX - 3), fill=style_of(track.condition).dark)
+    draw.text((11, middle), track.title, fill=DARK["ink"], font=_font(13, bold=True), anchor="lm")
+    if track.attack_id:
+        end = (canvas.width - 2, middle)
+        draw.text(end, track.attack_id, fill=DARK["muted"], font=_font(11), anchor="rm")
     _draw_status(canvas, index / rate_hz, cte, off_track_m, track.note if step > index else "")
     return np.asarray(canvas)
-
-
-def _draw_title(canvas: Image.Image, track: ClipTrack) -> None:
-    draw = ImageDraw.Draw(canvas)
-    draw.rectangle((0, 0, 4, _TITLE_PX - 3), fill=style_of(track.condition).dark)
-    draw.text((11, _TITLE_PX / 2 - 1), track.title, fill=DARK["ink"], font=_font(13, bold=True), anchor="lm")
-    if track.attack_id:
-        draw.text(
-            (canvas.width - 2, _TITLE_PX / 2 - 1),
-            track.attack_id,
-            fill=DARK["muted"],
-            font=_font(11),
-            anchor="rm",
-        )
 
 
 def _draw_status(canvas: Image.Image, time_s: float, cte_m: float, off_track_m: float, note: str) -> None:

@@ -82,24 +82,21 @@ def _result(result: AuditResult) -> Result:
     text = " ".join((result.verdict.sentence, *result.verdict.reasons))
     # The same finding in the next audit of the same policy in the same place, even with other numbers.
     same = hashlib.sha256(f"{rule}\n{result.policy.path}\n{result.place.name}".encode()).hexdigest()
+    # The policy file; its name for a policy without a file.
+    where = Location(physical_location=PhysicalLocation(artifact_location=_file(result, index=0)))
+    if result.policy.sha256 is None:
+        name = LogicalLocation(fully_qualified_name=result.policy.path, kind="module")
+        where = Location(logical_locations=[name])
     return Result(
         rule_id=rule,
         rule_index=list(_RULES).index(rule),
         kind=_KINDS[result.verdict.outcome],
         level=level,
         message=Message(text=text),
-        locations=[_location(result)],
+        locations=[where],
         partial_fingerprints={"policyAndPlace/v1": same},
         properties=_properties(result),
     )
-
-
-def _location(result: AuditResult) -> Location:
-    """The policy file; its name for a policy without a file."""
-    path = result.policy.path
-    if result.policy.sha256 is None:
-        return Location(logical_locations=[LogicalLocation(fully_qualified_name=path, kind="module")])
-    return Location(physical_location=PhysicalLocation(artifact_location=_file(result, index=0)))
 
 
 def _file(result: AuditResult, index: int | None = None) -> ArtifactLocation:

@@ -123,7 +123,16 @@ def run_attack(
         prepared = prepare(experiment, seed) if prepared is None else prepared.with_seed(seed)
         if on_prepared is not None:
             on_prepared(prepared)
-        _run_seed(prepared, display, on_evaluation)
+        state_path = experiment.folder / f"{name}.state.safetensors"
+        report = display.start(name)
+        report(0.0, "drive without attack")
+        told = telling(
+            planned_evaluations(prepared), report, prepared.clean_drive, prepared.problem.objective
+        )
+        result = search(prepared, state_path, _both(told, on_evaluation))
+        _keep(prepared, result)
+        state_path.unlink(missing_ok=True)
+        display.finish(name, sum(e.seconds for e in result.history), cached=False)
     return files
 
 
@@ -160,18 +169,6 @@ def _is_done(experiment: Experiment, seed: int) -> bool:
 def _curve_file(file: Path) -> Path:
     """Path of the curve beside an attack file."""
     return file.with_name(f"{file.name.partition('.')[0]}.json")
-
-
-def _run_seed(prepared: Prepared, display: StageDisplay, on_evaluation: OnEvaluation | None) -> None:
-    name = f"seed_{prepared.seed}"
-    state_path = prepared.experiment.folder / f"{name}.state.safetensors"
-    report = display.start(name)
-    report(0.0, "drive without attack")
-    told = telling(planned_evaluations(prepared), report, prepared.clean_drive, prepared.problem.objective)
-    result = search(prepared, state_path, _both(told, on_evaluation))
-    _keep(prepared, result)
-    state_path.unlink(missing_ok=True)
-    display.finish(name, sum(e.seconds for e in result.history), cached=False)
 
 
 def _run_together(

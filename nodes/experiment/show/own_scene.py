@@ -90,7 +90,14 @@ def flat_object(
         depth_m=face.size_m if thing.kind == CUBE else _SLAB_M,
     )
     if own and (border := _border_of(experiment, thing)) is not None:
-        field = with_border(field, _drawn(experiment, thing, *border))
+        # As the camera sees it: one mean colour for each cell of the face's size.
+        marker_m, across = border
+        frame = frame_around((thing.side_m, thing.side_m), 0, marker_m)
+        count = _resolution(experiment, face) + 2 * across
+        at_m = (np.arange(count * _FINER) + 0.5) / (count * _FINER) * frame.sheet_m[0]
+        inked, (display, _) = frame.drawn(at_m, at_m) / 255.0, display_of(face)
+        shown = inked if display is None else display.forward(inked)
+        field = with_border(field, shown.reshape(count, _FINER, count, _FINER, 3).mean(axis=(1, 3)))
     return replace(field, scale=field.scale * thing.scale)
 
 
@@ -104,18 +111,6 @@ def _border_of(experiment: Experiment, thing: PlacedObject) -> tuple[float, int]
     if face is None or face.marker_m is None:
         return None
     return whole_cells(thing.side_m, _resolution(experiment, face), face.marker_m)
-
-
-def _drawn(experiment: Experiment, thing: PlacedObject, marker_m: float, across: int) -> Array:
-    """The border of a print as the camera sees it: one mean colour for each cell of the face's size ``[n, n, 3]``."""
-    face = thing.face or FaceConfig()
-    frame = frame_around((thing.side_m, thing.side_m), 0, marker_m)
-    count = _resolution(experiment, face) + 2 * across
-    at_m = (np.arange(count * _FINER) + 0.5) / (count * _FINER) * frame.sheet_m[0]
-    inked = frame.drawn(at_m, at_m) / 255.0
-    display, _ = display_of(face)
-    seen = inked if display is None else display.forward(inked)
-    return np.asarray(seen.reshape(count, _FINER, count, _FINER, 3).mean(axis=(1, 3)))
 
 
 def _mesh(thing: PlacedObject, wanted: MeshConfig) -> tuple[MeshField, str]:
