@@ -101,14 +101,7 @@ def run_attack(
     chosen_method(experiment)  # before anything is loaded or written
     require_utf8(folder.absolute())
     experiment = replace(experiment, folder=folder.resolve())
-    kept, text = experiment.folder / REQUEST, request_text(experiment)
-    # One that failed to load is replaced.
-    if not kept.exists() or not is_begun(experiment.folder):
-        write_atomically(kept, text)
-    elif kept.read_text(encoding="utf-8") != text:
-        raise ConfigError(
-            f"{kept}: this folder belongs to another attack; resume it, or choose another folder"
-        )
+    _keep_request(experiment)
     look_at_given(experiment)
     if experiment.config.attack.together:
         return _run_together(experiment, display, on_evaluation, on_prepared)
@@ -123,22 +116,24 @@ def run_attack(
         prepared = prepare(experiment, seed) if prepared is None else prepared.with_seed(seed)
         if on_prepared is not None:
             on_prepared(prepared)
-        state_path = experiment.folder / f"{name}.state.safetensors"
-        report = display.start(name)
-        report(0.0, "drive without attack")
-        told = telling(
-            planned_evaluations(prepared), report, prepared.clean_drive, prepared.problem.objective
-        )
-        result = search(prepared, state_path, _both(told, on_evaluation))
-        _keep(prepared, result)
-        state_path.unlink(missing_ok=True)
-        display.finish(name, sum(e.seconds for e in result.history), cached=False)
+        _run_seed(prepared, display, on_evaluation)
     return files
 
 
 def attack_file(folder: Path, seed: int) -> Path:
     """Path of the attack file of a seed."""
     return folder / f"seed_{seed}.attack.safetensors"
+
+
+def _keep_request(experiment: Experiment) -> None:
+    """Write a request into its folder. Another one in it is refused once its search has begun; one that failed to load is replaced."""
+    kept, text = experiment.folder / REQUEST, request_text(experiment)
+    if not kept.exists() or not is_begun(experiment.folder):
+        write_atomically(kept, text)
+    elif kept.read_text(encoding="utf-8") != text:
+        raise ConfigError(
+            f"{kept}: this folder belongs to another attack; resume it, or choose another folder"
+        )
 
 
 def kept_request(folder: Path) -> Experiment:
@@ -169,6 +164,18 @@ def _is_done(experiment: Experiment, seed: int) -> bool:
 def _curve_file(file: Path) -> Path:
     """Path of the curve beside an attack file."""
     return file.with_name(f"{file.name.partition('.')[0]}.json")
+
+
+def _run_seed(prepared: Prepared, display: StageDisplay, on_evaluation: OnEvaluation | None) -> None:
+    name = f"seed_{prepared.seed}"
+    state_path = prepared.experiment.folder / f"{name}.state.safetensors"
+    report = display.start(name)
+    report(0.0, "drive without attack")
+    told = telling(planned_evaluations(prepared), report, prepared.clean_drive, prepared.problem.objective)
+    result = search(prepared, state_path, _both(told, on_evaluation))
+    _keep(prepared, result)
+    state_path.unlink(missing_ok=True)
+    display.finish(name, sum(e.seconds for e in result.history), cached=False)
 
 
 def _run_together(

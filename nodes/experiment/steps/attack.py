@@ -380,21 +380,6 @@ def telling(
 def attack_file(prepared: Prepared, result: SearchResult) -> AttackFile:
     """The attack file of a search's result; its prediction is made without disturbances."""
     experiment, space, problem = prepared.experiment, prepared.space, prepared.problem
-    extra = {
-        "experiment": experiment.config.name,
-        "victim": prepared.cell.victim,
-        "scenario": prepared.cell.scenario,
-        "horizon": experiment.searched_ticks,
-        "evaluations": len(result.history),
-        "start_states": problem.start_states[:, :3].tolist(),
-        "searched_space": experiment.config.space.model_dump(mode="json"),
-        **said_of_device(),
-        **objective_entry(
-            experiment.config.attack.objective, problem.objective, result.best.value, prepared.clean_value
-        ),
-    }
-    if identity := prepared.policy.metadata.get("not_fixed"):
-        extra["policy_not_fixed"] = identity
     attack = AttackFile(
         method=prepared.cell.method,
         space=space.name,
@@ -409,7 +394,7 @@ def attack_file(prepared: Prepared, result: SearchResult) -> AttackFile:
         seed=prepared.seed,
         predicted_total_cte_m=result.best.predicted_total_cte_m,
         software_version=version("advnerf"),
-        extra=extra,
+        extra=_extra(prepared, result),
         clean_drive=prepared.clean_drive,
     )
     if space.mount is not None:
@@ -429,3 +414,24 @@ def attack_file(prepared: Prepared, result: SearchResult) -> AttackFile:
         return attack
     _, totals_m = evaluate(past_field(experiment, problem.undisturbed(), space, shown), shown.colours)
     return replace(attack, field_total_cte_m=float(totals_m.protocol_cte_m.mean()))
+
+
+def _extra(prepared: Prepared, result: SearchResult) -> dict[str, Any]:
+    """Further data of an attack file beside its fields."""
+    experiment, problem = prepared.experiment, prepared.problem
+    found = {
+        "experiment": experiment.config.name,
+        "victim": prepared.cell.victim,
+        "scenario": prepared.cell.scenario,
+        "horizon": experiment.searched_ticks,
+        "evaluations": len(result.history),
+        "start_states": problem.start_states[:, :3].tolist(),
+        "searched_space": experiment.config.space.model_dump(mode="json"),
+        **said_of_device(),
+        **objective_entry(
+            experiment.config.attack.objective, problem.objective, result.best.value, prepared.clean_value
+        ),
+    }
+    if identity := prepared.policy.metadata.get("not_fixed"):
+        found["policy_not_fixed"] = identity
+    return found
