@@ -40,6 +40,7 @@ _ASKED = {
     "policy.architecture",
     "policy.hidden",
     "policy.configuration",
+    "carrier.kind",  # of the capture stage: for a warning, which is no result
 }
 
 
