@@ -28,6 +28,7 @@ Rgb = NDArray[np.uint8]
 Depth = NDArray[np.float32]
 Vector3 = tuple[float, float, float]
 _MOST_TURN_RADPS = 20.0
+_WIDEST_M = 20.0
 View = tuple[Rgb, Depth | None]
 """Colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None where depth was not wanted."""
 
@@ -177,8 +178,10 @@ class WorldDescription(PlainData):
         if len({len(path.goal) for path in self.paths.values()}) != 1:
             goals = ", ".join(f"{name} {list(path.goal)}" for name, path in self.paths.items())
             raise WorldError(f"expected goals of one length; got {goals}")
-        if not 0.0 < self.off_track_m < np.inf:
-            raise WorldError(f"expected off_track_m > 0; got {self.off_track_m}")
+        if not 0.0 < self.off_track_m <= _WIDEST_M:
+            raise WorldError(
+                f"expected off_track_m, half a lane, of more than 0 and at most {_WIDEST_M:g} m; got {self.off_track_m}; it is in metres"
+            )
         T = np.asarray(self.T_car_from_camera, dtype=np.float64)
         if (
             T.shape != (4, 4)

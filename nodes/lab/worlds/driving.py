@@ -74,6 +74,7 @@ def moves_as_described(bench: WorldBench) -> str:
                 f"expected the state's point to move along its heading; on path {name} it moves {slip_rad:.3f} rad aside: the state is the pose of the rear "
                 "axle, not of the body's middle"
             )
+        _require_command_kept(bench, path, name)
         told.append(f"{name} turn x {ratio:.2f}, speed x {speed_ratio:.2f}")
         off = max(off, abs(ratio - 1.0), abs(speed_ratio - 1.0))
     found = f"{_law(car)}: {'; '.join(told)}"
@@ -186,6 +187,48 @@ def _measured(bench: WorldBench, path: ReferencePath) -> tuple[float, float, flo
         slips.append(slip)
     expected = 2.0 * more_1pm * car.speed_mps
     return (rates[0] - rates[1]) / expected, float(np.mean(speeds)) / car.speed_mps, max(slips)
+
+
+def _require_command_kept(bench: WorldBench, path: ReferencePath, name: str) -> None:
+    """Raise unless a step returns the state, and the car moves at the state's speed, and by the speed and duration of the command."""
+    car, tick_s = bench.description.car, bench.tick_s
+    one_m, told_mps, free = _way_of_a_step(bench, path, car.speed_mps, tick_s)
+    slow_m = _way_of_a_step(bench, path, 0.5 * car.speed_mps, tick_s)[0]
+    long_m, _, still_free = _way_of_a_step(bench, path, car.speed_mps, 2.0 * tick_s)
+    if not (free and still_free):
+        return  # `blocked` tells of it
+    for what, share in (
+        (
+            f"a state's speed of {one_m / tick_s:.3g} m/s, at which the car moves; got {told_mps:.3g} m/s",
+            told_mps * tick_s / one_m,
+        ),
+        (
+            f"half the way with half the speed; the car moves {slow_m / one_m:.2f} times as far: obey speed_mps",
+            2.0 * slow_m / one_m,
+        ),
+        (
+            f"twice the way in {2.0 * tick_s:g} s as in {tick_s:g} s; the car moves {long_m / one_m:.2f} times as far: obey duration_s",
+            0.5 * long_m / one_m,
+        ),
+    ):
+        if abs(share - 1.0) > _SPEED_TOLERANCE:
+            raise NotMet(f"on path {name}: expected {what}")
+
+
+def _way_of_a_step(
+    bench: WorldBench, path: ReferencePath, speed_mps: float, duration_s: float
+) -> tuple[float, float, bool]:
+    """Way of a step [m] after others of its speed, the speed of the state after it [m/s], and whether nothing is in the way."""
+    world = bench.world
+    world.reset(*path.pose_at(0.0))
+    for _ in range(max(round(_MEASURED_S / bench.tick_s), 4)):
+        world.step(0.0, speed_mps, bench.tick_s)
+    before = world.state
+    after = world.step(0.0, speed_mps, duration_s)
+    if after != world.state:
+        raise NotMet(f"expected step to return the state; got {after}, and a state of {world.state}")
+    way_m = math.dist((after.x_m, after.y_m), (before.x_m, before.y_m))
+    return way_m, world.state.speed_mps, not world.blocked
 
 
 def _steady(poses: Array, tick_s: float) -> tuple[float, float, float]:

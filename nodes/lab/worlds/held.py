@@ -12,7 +12,7 @@ import numpy as np
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole, VehicleState
-from advnerf_core.plugins import PluginError, in_one_line
+from advnerf_core.plugins import FAILURES, PluginError, in_one_line, is_signal
 from hardware.worlds.world import World, WorldClass, WorldDescription, members_of_a_world
 from nodes.runtime.findings import NotMet, form_of
 
@@ -60,6 +60,10 @@ def _made(base: type[Any], kind: str) -> type[Any]:
     members: dict[str, Any] = {}
     for name in ("__init__", *members_of_a_world()):
         member = inspect.getattr_static(base, name, None)
+        if inspect.isfunction(member) and isinstance(inspect.getattr_static(World, name, None), property):
+            raise OwnWorldError(
+                f"world {kind}: expected {name} to be a value or a property; got a method, which counts as true; write @property above it"
+            )
         if isinstance(member, property):
             members[name] = property(_held(member.fget, kind, name))
         elif inspect.isfunction(member):
@@ -74,18 +78,23 @@ def _held(member: Any, kind: str, name: str) -> Callable[..., Any]:
 
     @wraps(member)
     def call(world: Any, *args: Any, **named: Any) -> Any:
+        # A world that writes into a pose would move it for whoever asked.
+        args = tuple(each.copy() if isinstance(each, np.ndarray) else each for each in args)
         try:
             given = member(world, *args, **named)
         except AdvnerfError:
             raise
-        except Exception as error:
+        except FAILURES as error:
+            if isinstance(error, SystemExit) and is_signal(error.code):
+                raise
             raise OwnWorldError(f"world {kind}: {name} has failed: {in_one_line(error)}") from error
         if require is not None:
             try:
                 require(world, given, name)
             except NotMet as wrong:
                 raise OwnWorldError(f"world {kind}: {wrong}") from None
-        return given
+        # True would hide the errors of who uses the world.
+        return None if name == "__exit__" else given
 
     return call
 
@@ -121,11 +130,23 @@ def _require_description(_world: World, described: Any, name: str) -> None:
 def _require_state(_world: World, state: Any, name: str) -> None:
     if not isinstance(state, VehicleState):
         raise NotMet(f"expected a VehicleState from {name}; got {form_of(state)}")
-    if not np.isfinite([state.x_m, state.y_m, state.yaw_rad]).all():
+    if not np.isfinite([state.x_m, state.y_m, state.yaw_rad, state.speed_mps]).all():
         raise NotMet(f"expected a finite state of the car from {name}; got {state}")
 
 
+def _require_opened(_world: World, opened: Any, name: str) -> None:
+    if not callable(getattr(opened, "describe", None)):
+        raise NotMet(f"expected {name} to return the world; got {form_of(opened)}; end it with return self")
+
+
+def _require_yes_or_no(_world: World, answer: Any, name: str) -> None:
+    if not isinstance(answer, bool | np.bool_):
+        raise NotMet(f"expected True or False from {name}; got {form_of(answer)}")
+
+
 _REQUIRED: dict[str, Callable[[World, Any, str], None]] = {
+    "__enter__": _require_opened,
+    "blocked": _require_yes_or_no,
     "observe": _require_view,
     "observe_at": _require_view,
     "photograph": _require_photograph,

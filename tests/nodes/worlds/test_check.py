@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from advnerf_core.geometry import (
     planar_pose,
 )
 from hardware.worlds.paths import ReferencePath
-from hardware.worlds.world import Box, CarDescription, NotOpenError
+from hardware.worlds.world import Box, CarDescription, NotOpenError, WorldError
 from nodes.lab.worlds.check import check_world
 from nodes.lab.worlds.named import NamedWorld, read_world
 from nodes.runtime.errors import ConfigError
@@ -208,6 +209,43 @@ class WheelsInDegrees(Small):
         return super().step(math.radians(wheel), speed, duration)
 
 
+class StateInKilometresPerHour(Small):
+    @property
+    def state(self) -> Any:
+        found = super().state
+        return replace(found, speed_mps=3.6 * found.speed_mps)
+
+
+class OneSpeed(Small):
+    def step(self, wheel_rad: float, speed_mps: float, duration_s: float) -> Any:
+        return super().step(wheel_rad, self.config.speed_mps, duration_s)
+
+
+class OneTick(Small):
+    def step(self, wheel_rad: float, speed_mps: float, duration_s: float) -> Any:
+        return super().step(wheel_rad, speed_mps, 0.1)
+
+
+class ReturnsTheStateBefore(Small):
+    def step(self, wheel_rad: float, speed_mps: float, duration_s: float) -> Any:
+        before = self.state
+        super().step(wheel_rad, speed_mps, duration_s)
+        return before
+
+
+class PhotographsInMillimetres(Small):
+    def photo_poses(self, count: int, rng: np.random.Generator) -> Any:
+        return [
+            T @ np.eye(4) * np.array([[1, 1, 1, 1e3]] * 3 + [[1] * 4])
+            for T in super().photo_poses(count, rng)
+        ]
+
+
+class LanesInCentimetres(Small):
+    def describe(self) -> Any:
+        return replace(super().describe(), off_track_m=60.0)
+
+
 class WrongWheelbase(Small):
     def describe(self) -> Any:
         return self.changed(car=CarDescription("ackermann", self.config.speed_mps, (-0.5, 0.5), 0.3))
@@ -348,6 +386,15 @@ class Raises(Small):
         (SteersTheOtherWay, "car", "it turns right"),
         (KilometresPerHour, "car", "0.28 times as fast; speeds are in m/s"),
         (WheelsInDegrees, "car", "in degrees?"),
+        (
+            StateInKilometresPerHour,
+            "car",
+            "expected a state's speed of 1.2 m/s, at which the car moves; got 4.32 m/s",
+        ),
+        (OneSpeed, "car", "obey speed_mps"),
+        (OneTick, "car", "obey duration_s"),
+        (ReturnsTheStateBefore, "car", "expected step to return the state"),
+        (PhotographsInMillimetres, "coverage", "poses are in metres"),
         (WrongWheelbase, "car", "0.60 times as fast; correct kind"),
         (StateInDegrees, "reset", "yaw is in radians"),
         (BodysMiddle, "reset", "after reset"),
@@ -387,6 +434,11 @@ def test_a_small_fault_is_met_but_shown(fault: Callable[..., Any], part: str, to
     (finding,) = [each for each in check_world(small(fault), only=[part]) if each.name == part]
     assert (finding.state, finding.met) == ("met, but look", True), finding.text
     assert told in finding.text
+
+
+def test_lanes_in_another_unit_are_refused() -> None:
+    with pytest.raises(WorldError, match=r"half a lane, .* at most 20 m; got 60\.0; it is in metres"):
+        check_world(small(LanesInCentimetres))
 
 
 def test_parts_are_looked_at_alone_and_unknown_ones_are_refused() -> None:

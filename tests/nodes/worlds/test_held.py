@@ -84,6 +84,26 @@ WRONG = {
         lambda world: world.describe(),
         r"expected a WorldDescription from describe; got NoneType",
     ),
+    "nothing opened": (
+        "    def __enter__(self): pass\n",
+        lambda world: None,
+        r"expected __enter__ to return the world; got NoneType; end it with return self",
+    ),
+    "neither yes nor no": (
+        "    @property\n    def blocked(self): pass\n",
+        lambda world: world.blocked,
+        r"expected True or False from blocked; got NoneType",
+    ),
+    "a method in the place of a value": (
+        "    def blocked(self): return False\n",
+        lambda world: None,
+        r"expected blocked to be a value or a property; got a method, which counts as true",
+    ),
+    "an exit": (
+        "    def observe_at(self, *pose, depth=True): raise SystemExit(0)\n",
+        look,
+        r"observe_at has failed: SystemExit: 0 \(\S*mine\.py:8\)",
+    ),
     "an error": (
         "    def observe_at(self, *pose, depth=True):\n        return {}['camera']\n",
         look,
@@ -121,6 +141,17 @@ def test_the_check_of_a_world_reports_it_as_a_part_that_is_not_met(tmp_path):
     last = check_world(named)[-1]
     assert last.state == "not met"
     assert re.search(r"observe_at has failed: KeyError: 'camera' \(\S*mine\.py:8\)", last.text)
+
+
+def test_a_world_neither_moves_the_pose_that_it_is_given_nor_hides_errors(tmp_path):
+    members = "    def photograph(self, T):\n        T[:3, 3] += 100.0\n        return super().photograph(T - 100.0)\n"
+    members += "    def __exit__(self, *error): return True\n"
+    with own(tmp_path, members).make() as world:
+        (pose,) = world.photo_poses(1, np.random.default_rng(0))
+        before = pose.copy()
+        world.photograph(pose)
+        assert (pose == before).all()
+    assert not world.__exit__(KeyError, KeyError("mine"), None)
 
 
 def test_our_own_errors_pass_and_a_good_world_is_unchanged(tmp_path):
