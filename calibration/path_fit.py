@@ -111,7 +111,7 @@ def fit_path(trace: ArrayLike, closed: bool | None = None) -> PathFit:
 
 
 def _require_along_trace(fit: PathFit) -> None:
-    """Refuse a path with a part where nobody was: each of the trace's points is on it all the same."""
+    """Refuse a path with a part that was not driven: each of the trace's points is on it all the same."""
     xy = fit.path.pose_at(np.arange(0.0, fit.path.length_m, _STEP_M))[:, :2]
     away_m = cKDTree(fit.trace[:, :2]).query(xy)[0]
     worst = int(away_m.argmax())
@@ -123,7 +123,7 @@ def _require_along_trace(fit: PathFit) -> None:
 
 
 def _require_drivable(fit: PathFit) -> None:
-    """Refuse a path that turns back on the spot, as that of a way there and back does."""
+    """Refuse a path that turns back on the spot, as one there and back does."""
     x_m, y_m, yaw_rad = fit.path.pose_at(np.arange(0.0, fit.path.length_m, _STEP_M)).T
     reach = round(_TURN_BACK_M / _STEP_M)
     turned_rad = np.abs(np.unwrap(yaw_rad)[reach:] - np.unwrap(yaw_rad)[:-reach])
