@@ -22,6 +22,7 @@ from advnerf_core.attack.objectives import CTE
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
+from advnerf_core.plugins import in_one_line
 from advnerf_core.strict import StrictModel
 from nodes.experiment.node.job import REQUEST, Job, Said, is_begun
 from nodes.experiment.node.request import parse_request
@@ -184,9 +185,13 @@ class AttackNode(Node):
         self._job = Job(self._folder / request_id, self.inbox, self._config.threads)
 
     def _cancel(self, message: Any) -> None:
-        if (wanted := str(message.request_id)) not in ("", self._request_id):
+        wanted = str(message.request_id)
+        if wanted not in ("", self._request_id) or (self._job is None and not wanted):
+            running = "none is running" if self._job is None else f"{self._request_id} is running and goes on"
             raise AdvnerfError(
-                f"expected the id of the present request, {self._request_id or 'of which there is none'}, got {wanted}; nothing was cancelled"
+                f"expected the search {wanted} to cancel it; {running}"
+                if wanted
+                else f"nothing to cancel: {running}"
             )
         if self._job is not None:
             self._keep("cancelled")
@@ -206,11 +211,16 @@ class AttackNode(Node):
         write_atomically(self._folder / _CURRENT, json.dumps(content) + "\n")
 
     def _resume(self) -> None:
-        """Continue an interrupted search, and send again a finished file."""
+        """Continue an interrupted search, and send again a finished file. What was changed or deleted since must not keep the node from other requests."""
         try:
-            current = read_json(self._folder / _CURRENT)
-        except FileNotFoundError:
-            return
+            self._go_on(read_json(self._folder / _CURRENT))
+        except FileNotFoundError as error:
+            if Path(error.filename or "").name != _CURRENT:
+                self._progress = _fresh("failed", _not_taken_up(error))
+        except (AdvnerfError, OSError, LookupError, TypeError, ValueError) as error:
+            self._progress = _fresh("failed", _not_taken_up(error))
+
+    def _go_on(self, current: dict[str, str]) -> None:
         if current["state"] == "running":
             self._start(current["request_id"])
             return
@@ -242,6 +252,10 @@ class AttackNode(Node):
                 **progress,
             ),
         )
+
+
+def _not_taken_up(error: Exception) -> str:
+    return f"before this start; cannot go on with it: {in_one_line(error)}"
 
 
 def _objective_of(attack: AttackFile) -> dict[str, Any]:

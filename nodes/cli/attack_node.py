@@ -55,9 +55,9 @@ def attack_cancel(
     from nodes.experiment.node.client import cancel_attack
     from nodes.launching.watching import find_run_dir
 
-    last = cancel_attack(find_run_dir(run_dir), request_id, reason)
-    print(in_words(last))
-    fail_unless(last.state != "refused")
+    answer = cancel_attack(find_run_dir(run_dir), request_id, reason)
+    print(in_words(answer))
+    fail_unless(answer.state != "refused")
 
 
 def in_words(progress: Any) -> str:

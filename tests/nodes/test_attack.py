@@ -1,5 +1,6 @@
 import hashlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -171,6 +172,10 @@ def test_a_cancel_is_answered_at_once_and_the_same_request_goes_on(bench, tmp_pa
     bench.request(text)
     bench.run_until(lambda: bench.progress()[-1].evaluation >= 3)
     worker = int(bench.node.counters()["worker_pid"])
+    assert bench.cancel("another") < 5.0
+    assert (bench.state(), bench.progress()[-1].request_id) == ("refused", "another")
+    assert bench.progress()[-1].text == "expected the search another to cancel it; a is running and goes on"
+    assert bench.node.status()[0] == "active"
     assert bench.cancel("a") < 5.0
     assert (bench.state(), bench.progress()[-1].text) == ("cancelled", "enough")
     with pytest.raises(ProcessLookupError):
@@ -211,14 +216,60 @@ def test_what_cannot_be_done_is_refused_in_words(bench, tmp_path):
     bench.request(text, "a")
     assert refused(text, "a") != "refused"
     assert refused(text, "b") == "busy with a; wait for it, or cancel it"
+    bench.cancel("b")
+    assert bench.progress()[-1].text == "expected the search b to cancel it; a is running and goes on"
     assert "another request already" in refused(text.replace("horizon: 3", "horizon: 4"))
-    bench.cancel("another")
-    told = bench.progress()[-1]
-    assert (told.state, told.request_id) == ("refused", "another")
-    assert told.text == "expected the id of the present request, a, got another; nothing was cancelled"
     assert bench.node.counters()["worker_pid"]
     bench.cancel("a")
     assert bench.state() == "cancelled"
+
+
+def test_a_cancel_without_a_search_is_refused(bench):
+    bench.cancel()
+    assert (bench.state(), bench.progress()[-1].text) == (
+        "refused",
+        "nothing to cancel: none is running",
+    )
+
+
+@pytest.mark.parametrize(
+    ("current", "says"),
+    [
+        ('{"request_id": "a", "state": "done", "file": "FOLDER/a.attack.safetensors"}', "a.attack.safetensors as an attack file"),
+        ('{"request_id": "a", "state": "running"}', "No such file or directory.*attack/a"),
+        ('{"request_id": "a"}', "KeyError: 'state'"),
+        ('{"request_id"', "current.json"),
+        ("[]", "cannot go on with it"),
+    ],
+)  # fmt: skip
+def test_what_was_damaged_between_two_starts_does_not_keep_a_node_from_starting(tmp_path, current, says):
+    """It is started again by itself, and would die of the same file each time."""
+    folder = tmp_path / "run" / "attack"
+    folder.mkdir(parents=True)
+    (folder / "a.attack.safetensors").write_bytes(b"half")
+    (folder / "current.json").write_text(current.replace("FOLDER", str(folder)))
+    bench = Bench(tmp_path / "run")
+    try:
+        state, text = bench.node.status()[0], bench.node._progress["text"]
+        assert (state, bench.node._progress["state"]) == ("ready", "failed")
+        assert re.search(f"cannot go on with it: .*{says}|{says}", text), text
+        bench.request(request_text(loaded(tiny_request(tmp_path, evaluations=400))), "b")
+        assert bench.state() == "preparing"
+    finally:
+        bench.close()
+
+
+@pytest.mark.parametrize(
+    ("fails", "says"),
+    [("raise KeyError('mine')", r"your code has failed: KeyError: 'mine' \(.*mine\.py:5\)"), ("raise SystemExit(0)", r"has called sys\.exit")],
+)  # fmt: skip
+def test_a_search_that_a_user_s_code_ends_says_where(bench, tmp_path, fails, says):
+    (tmp_path / "mine.py").write_text(
+        f"from advnerf_core.attack.objective import Objective\n\nclass Mine(Objective):\n    def value(self, drives):\n        {fails}\n"
+    )
+    bench.request(request_text(loaded(tiny_request(tmp_path), ["attack.objective=mine.py:Mine"])))
+    bench.run_until(lambda: bench.state() == "failed")
+    assert re.search(says, bench.progress()[-1].text), bench.progress()[-1].text
 
 
 def test_a_search_that_fails_says_why(bench, tmp_path):
@@ -333,7 +384,9 @@ def test_a_killed_node_goes_on_and_a_running_compositor_takes_the_attack_over(tm
                 car.see()
             car.see()
         direct = load_attack(run_dir / "attack" / "live" / "seed_0.attack.safetensors")
-        whole = load_attack(search.run_attack(request, tmp_path / "whole", _Silent())[0])
+        whole = load_attack(
+            on_one_thread(lambda: search.run_attack(request, tmp_path / "whole", _Silent()))[0]
+        )
         ids = [label.attack_id for label in car.labels]
         assert sorted(set(ids)) == ["", direct.attack_id]
         assert ids == sorted(ids)

@@ -123,7 +123,7 @@ def load_state(path: Path, fingerprint: str) -> SearchState:
         raise SearchStateError(f"cannot resume from {path} ({error}); delete it to start afresh") from error
     if header.get("fingerprint") != fingerprint:
         raise SearchStateError(
-            f"{path} belongs to a search with other settings; delete it, or use another folder"
+            f"{path} belongs to a search with other settings, or to one before a file that it names has changed; delete it, or use another folder"
         )
     return SearchState(tensors, best_theta, history)
 

@@ -19,9 +19,10 @@ from torch import Tensor
 from advnerf_core.attack.artifact import face_texture, load_attack
 from advnerf_core.attack.search.record import Evaluation
 from advnerf_core.attack.search.search import evaluation_from_json
+from advnerf_core.code_files import was_raised_by_a_user
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import read_tensors
-from advnerf_core.plugins import name_in_results
+from advnerf_core.plugins import exit_refused, in_one_line, name_in_results
 from advnerf_core.policies.network import tensor_to_images
 from nodes.experiment.node.job import TOGETHER_STATE
 from nodes.experiment.node.search import kept_request, planned_evaluations, run_attack
@@ -153,9 +154,15 @@ def main() -> int:
     stream = os.fdopen(os.dup(1), "wb", closefd=False)
     os.dup2(2, 1)
     try:
-        work(Path(sys.argv[1]), stream)
+        with exit_refused():
+            work(Path(sys.argv[1]), stream)
     except AdvnerfError as error:
         print(" ".join(str(error).split()), file=sys.stderr, flush=True)
+        return 1
+    except Exception as error:
+        if not was_raised_by_a_user(error):
+            raise
+        print(f"your code has failed: {in_one_line(error)}", file=sys.stderr, flush=True)
         return 1
     return 0
 
