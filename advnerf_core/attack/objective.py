@@ -26,6 +26,8 @@ from advnerf_core.plugins import exit_refused, torch_left_as_it_is
 
 # A path that turns by less over a drive has no outside [rad].
 _LEAST_TURN_RAD = 0.2
+# Slopes of a loss and of its value that are so alike are no relaxation's.
+_SAME_WAY = 0.9
 
 
 class ObjectiveError(AdvnerfError, ValueError):
@@ -313,7 +315,7 @@ def loss_slopes(objective: Objective, drives: JudgedDrives) -> tuple[float, Tens
     """The mean loss, and its derivative with respect to each state while all others are held, ``[T + 1, B, n]``.
 
     Raises:
-        ObjectiveError: The loss is not differentiable in the states.
+        ObjectiveError: The loss is not differentiable in the states, or rises with the value, which a search would make small.
     """
     states = drives.states.detach().requires_grad_()
     with torch.enable_grad():
@@ -324,6 +326,8 @@ def loss_slopes(objective: Objective, drives: JudgedDrives) -> tuple[float, Tens
                 "compute it with torch from drives.states, drives.cte_m or drives.clearances_m, or search without a gradient"
             )
         (slopes,) = torch.autograd.grad(loss, states)
+        if type(objective).__module__ != __name__ and type(objective).loss is not Objective.loss:
+            _require_falling(objective, replace(drives, states=states), slopes)
     return float(loss.detach()), slopes
 
 
@@ -340,6 +344,22 @@ def _judged(objective: Objective, what: Literal["value", "loss"], drives: Judged
     if type(objective).__module__ != __name__:
         _require_judged_alone(objective, what, drives, found)
     return found
+
+
+def _require_falling(objective: Objective, drives: JudgedDrives, slopes: Tensor) -> None:
+    """Raise for a loss whose slopes are those of the value; a value without slopes, such as a count, says nothing."""
+    value = _judged(objective, "value", drives)
+    if not value.requires_grad:
+        return
+    (up,) = torch.autograd.grad(value.mean(), drives.states, allow_unused=True)
+    if up is None or not up.any():
+        return
+    cosine = float(torch.nn.functional.cosine_similarity(up.flatten(), slopes.flatten(), dim=0))
+    if cosine > _SAME_WAY:
+        raise ObjectiveError(
+            f"expected a loss of {type(objective).__name__} that falls as its value rises, got one that rises with it (cosine of their slopes {cosine:+.2f}): "
+            "a search makes the loss small and keeps the largest value; negate one of them"
+        )
 
 
 def _called(objective: Objective, what: Literal["value", "loss"], drives: JudgedDrives) -> object:

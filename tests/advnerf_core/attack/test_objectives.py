@@ -341,6 +341,28 @@ def test_an_objective_of_one_drive_that_draws_lots_is_refused():
         values_of(DrawsLots(), random_drives(1))
 
 
+def test_a_loss_that_rises_with_its_value_is_refused():
+    """A gradient would keep the car on its path, and the first texture would be the result."""
+
+    class Forgot(Objective):
+        def value(self, drives):
+            return drives.cte_m.abs().sum(0)
+
+        def loss(self, drives):
+            return drives.cte_m.abs().sum(0)
+
+    class Relaxed(Forgot):
+        def loss(self, drives):
+            return -torch.tanh(drives.cte_m.abs()).sum(0)
+
+    with pytest.raises(
+        ObjectiveError,
+        match=r"loss of Forgot that falls as its value rises, .*cosine of their slopes \+1\.00",
+    ):
+        loss_slopes(Forgot(), random_drives(3))
+    assert loss_slopes(Relaxed(), random_drives(3))[0] < 0.0
+
+
 def test_what_an_objective_keeps_has_no_address_in_a_state(tmp_path):
     class Keeps(CountsItsCalls):
         def __init__(self):
