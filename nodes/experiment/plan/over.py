@@ -61,6 +61,10 @@ class OverConfig(StrictModel):
             values = getattr(self, name) or ()
             # Two files may have methods of one name.
             names = [name_in_results(value) for value in values] if name == "method" else values
+            if name == "method" and len(set(values)) == len(values) and len(set(names)) != len(names):
+                raise ValueError(
+                    f"expected methods of different names, as cells and files are called by them, got {', '.join(map(str, names))}; rename one in its file"
+                )
             if len(set(names)) != len(names):
                 raise ValueError(f"expected every one of over.{name} once, got {list(values)}")
         return self

@@ -94,7 +94,10 @@ def test_a_broken_method_fails_alone_and_in_one_line(searching):
             ["none", "spiral"],
             r": over.method.1: expected an attack method of random, .*; got 'spiral'; one of your own is file.py:Name",
         ),
-        (["spiral.py:Spiral", "other.py:Spiral"], "every one of over.method once"),
+        (
+            ["spiral.py:Spiral", "other.py:Spiral"],
+            "expected methods of different names, .* got Spiral, Spiral; rename one in its file",
+        ),
         (["spiral.py:cem"], "expected a name that no other condition has, got cem"),
     ],
 )
