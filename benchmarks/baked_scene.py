@@ -37,11 +37,10 @@ from advnerf_core.objects.voxel.model import load_object, save_object
 from advnerf_core.scene.surrogate import BackgroundRenderer
 from advnerf_core.splats.scene_file import bake_scene
 from benchmarks.results import REPOSITORY, record_row
-from benchmarks.run_folders import experiment_in
 from benchmarks.timing import seconds_in_turns
 from nodes.experiment.plan.victims import HARDENED, NAIVE
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import deployed_drives
+from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.faces import PaintedScene, face_space
 from nodes.experiment.show.learned_scene import load_background, load_field
 from nodes.experiment.show.victims import load_victim
@@ -342,7 +341,7 @@ def main() -> None:
     )
     parser.add_argument("--frames", action="store_true", help="compare frames alone, in any run folder")
     options = parser.parse_args()
-    experiment = experiment_in(options.run.resolve())
+    experiment = Experiment.resolved_in(options.run.resolve())
     backgrounds: Backgrounds = {"field": load_field(experiment), "baked": load_background(experiment)}
     if options.frames:
         frames(experiment, backgrounds, options.run)

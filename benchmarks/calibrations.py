@@ -36,7 +36,7 @@ from calibration.vehicle_response import fit_response
 from hardware.worlds.lab.config import CarConfig, LabConfig, MonitorOpticsConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.vehicle import TwinVehicle
-from nodes.experiment.show import faces
+from nodes.experiment.show import screen
 
 COMMAND = "python -m benchmarks.calibrations"
 MOCAP_M, MOCAP_RAD, PIXEL_STDDEV, TAPE_M = 0.0005, 0.001, 1.5, 0.001
@@ -209,7 +209,7 @@ def measure_display(world: Lab, seed: int) -> tuple[float, float]:
     """RMSE on held-out colours, of the model and of a monitor taken for ideal, over three places of the car."""
     rng = np.random.default_rng(seed)
     panel = world.describe().panels["monitor"]
-    fit = faces.measure_display(
+    fit = screen.measure_display(
         world, "monitor", panel, seed, lambda clean: [noisy_image(clean, rng) for _ in range(8)]
     )
     ideal = float(np.sqrt(np.mean((fit.shown[fit.held_out] - fit.seen[fit.held_out]) ** 2)))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri, stdtr, stdtrit
 
 from advnerf_core.report.evidence.exact import permutation_test
-from advnerf_core.report.evidence.intervals import MeanEstimate, crossed, difference
+from advnerf_core.report.evidence.mean_estimate import MeanEstimate, crossed, difference
 from benchmarks.results import record_row
 
 Floats = NDArray[np.float64]

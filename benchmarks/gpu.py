@@ -23,10 +23,10 @@ from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.scene.agreement import search_device
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.results import record_row
-from benchmarks.run_folders import experiment_in
 from benchmarks.ticks import hydrants
 from benchmarks.timing import seconds_in_turns
 from nodes.experiment.plan.victims import HARDENED
+from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import face_space
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.show.victims import load_victim
@@ -55,7 +55,7 @@ def main() -> None:
             )
         return
     use_device("cuda")
-    experiment = experiment_in(arguments.run_folder.resolve())
+    experiment = Experiment.resolved_in(arguments.run_folder.resolve())
     policy, scenario = load_victim(experiment, HARDENED), experiment.config.paths[0]
     background = load_background(experiment)
     surrogate = Surrogate(background, experiment.view.pinhole, experiment.mount, hydrants(1))

@@ -35,10 +35,10 @@ def main() -> None:
 
 
 def _judge(run: Path, victim: str, textures: int) -> None:
-    from benchmarks.run_folders import experiment_in
     from benchmarks.victim_hardness import judge
+    from nodes.experiment.show.context import Experiment
 
-    experiment = experiment_in(run.resolve())
+    experiment = Experiment.resolved_in(run.resolve())
     verdict = judge(experiment, victim, textures)
     for found in verdict.families:
         bound = "no bound from one start" if found.upper_m is None else f"at most {found.upper_m:.4f} m"

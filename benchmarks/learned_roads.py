@@ -19,7 +19,6 @@ from advnerf_core.driving.metrics import mean_cte_limit_m
 from advnerf_core.policies.policy_file import load_policy
 from advnerf_core.report.cells import read_cell
 from benchmarks.results import record_row
-from benchmarks.run_folders import experiment_in
 from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import victim_spec
@@ -41,7 +40,7 @@ def main() -> None:
     if arguments.cell is not None and len(arguments.run_folders) > 1:
         parser.error("expected one run folder with --cell, got several")
     for folder in arguments.run_folders:
-        experiment = experiment_in(folder)
+        experiment = Experiment.resolved_in(folder)
         record(experiment, arguments.cell, arguments.victim_of)
         if arguments.wall_s is not None:
             _record_time(experiment, arguments.wall_s / 60.0)
@@ -85,7 +84,7 @@ def record(experiment: Experiment, cell: Path | None = None, victim_of: Path | N
     if victim_of is None:
         views = read_json(folder / "policy" / "policy.json")["on_held_out_views"]
     else:
-        other = experiment_in(victim_of)
+        other = Experiment.resolved_in(victim_of)
         victim, whose = (
             Path(victim_spec(other, HARDENED)),
             f"; by the victim of {road_of(other.config.world)}",

@@ -18,7 +18,7 @@ from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, PRESETS
 from advnerf_core.scene.train import train_scene
 from benchmarks.exposure import compare
 from benchmarks.results import record_row
-from benchmarks.run_folders import experiment_in
+from nodes.experiment.show.context import Experiment
 from nodes.experiment.steps import capture
 from nodes.experiment.steps.scene import field_config
 
@@ -69,7 +69,7 @@ def _scene(folder: Path) -> tuple[str, PosedImages, SceneFieldConfig, float]:
     """Name, photographs, field and nearest distance of what is learned."""
     preset = PRESETS["minutes"]
     if (folder / "manifest.json").exists():
-        experiment = experiment_in(folder.resolve())
+        experiment = Experiment.resolved_in(folder.resolve())
         field = field_config(experiment)
         field = replace(field, grid=preset.grid_for(field.contraction), direction_bands=PHOTOGRAPH_BANDS)
         photographs = load_transforms(experiment.stage_folder("capture") / capture.PHOTOS)

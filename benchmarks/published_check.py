@@ -85,7 +85,7 @@ def gate_problems() -> Iterator[str]:
 def _verdicts(experiment: Experiment, folder: Path) -> Iterator[str]:
     cells = {gate_key(cell): cell for cell in experiment.cells}
     for key, cell in sorted(cells.items()):
-        limits = (experiment.variants[cell.variant] if cell.variant else experiment.config).gate
+        limits = experiment.config_of(cell).gate
         for drive, of in ((False, "held-out views"), (True, "drive without attack")):
             file = gate_file(folder, key, drive)
             if not isinstance(limits, GateLimits) or not file.exists():

@@ -23,8 +23,8 @@ from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.together import gradient_attacks
 from benchmarks.results import record_row
-from benchmarks.run_folders import experiment_in
 from nodes.experiment.plan.victims import HARDENED
+from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.faces import face_space
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import attack_problem
@@ -93,7 +93,7 @@ def _run(folder: Path, shares: list[list[int]], batch: bool, threads: int) -> fl
 
 def _timed(folder: Path, seeds: list[int], batch: bool) -> float:
     """Seconds of the iterations of these seeds in this process."""
-    experiment = experiment_in(folder.resolve())
+    experiment = Experiment.resolved_in(folder.resolve())
     space, policy = face_space(experiment), load_victim(experiment, HARDENED)
     (scenario,) = experiment.config.paths
 

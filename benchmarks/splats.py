@@ -23,9 +23,9 @@ from advnerf_core.splats.gaussians import COLOUR_OFFSET, CONSTANT_BASIS, Gaussia
 from advnerf_core.splats.renderer import NEAR_M, SplatRenderer
 from benchmarks.baked_scene import searched_pairs
 from benchmarks.results import record_row
-from benchmarks.run_folders import experiment_in
 from benchmarks.timing import ProcessorUse, seconds_in_turns
 from nodes.experiment.plan.victims import HARDENED
+from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import load_background
 from nodes.experiment.steps import bake as bake_stage
 from tests.support.splat_reference import render_reference
@@ -134,7 +134,7 @@ def splat_of(background: BackgroundRenderer, poses: Array, pinhole: Pinhole) -> 
 
 def attack(run: Path) -> None:
     """What searches in a splat of the room and in its field find, deployed."""
-    experiment = experiment_in(run.resolve())
+    experiment = Experiment.resolved_in(run.resolve())
     field, poses, pinhole = (
         load_background(experiment),
         bake_stage.views_of(experiment),

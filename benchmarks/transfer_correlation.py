@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from advnerf_core.documents import read_json
-from advnerf_core.report.conditions import CONTROLS, LIGHT
+from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.evidence.page import groups_of_searches
 from advnerf_core.report.evidence.results import Evidence, mean_excess_m
 from advnerf_core.report.evidence.verifying.layout import SET, complete_sets
+from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes
 from advnerf_core.report.reference import DOMAINS
 from benchmarks.predictions import PUBLISHED, evidence_of

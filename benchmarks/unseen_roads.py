@@ -19,7 +19,8 @@ from advnerf_core.policies.network import Policy
 from benchmarks.results import REPOSITORY, record_row
 from nodes.experiment.plan.victims import HARDENED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import Dressed, deployed_drives
+from nodes.experiment.show.deployed import Dressed
+from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import placed_objects
 from nodes.experiment.show.victims import load_victim

@@ -12,13 +12,13 @@ from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import SearchRun, load_method
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.driving.metrics import no_effect_m
-from advnerf_core.files import write_json
 from advnerf_core.report.evidence.hardness import (
     FILE,
     FamilyHardness,
     HardnessError,
     HardnessVerdict,
     read_hardness,
+    write_hardness,
 )
 from nodes.experiment.run.registering import VALIDATED_ON
 from nodes.experiment.show.context import Experiment
@@ -68,7 +68,7 @@ def judge(experiment: Experiment, victim: str, textures: int = 0) -> HardnessVer
         margin_m=no_effect_m(experiment.limits.off_track_m),
         families=tuple(family_hardness(experiment, victim, VALIDATED_ON, count)),
     )
-    write_json(experiment.folder / FILE, record.with_verdict(verdict).model_dump(mode="json"))
+    write_hardness(experiment.folder / FILE, record.with_verdict(verdict))
     return verdict
 
 

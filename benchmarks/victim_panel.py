@@ -19,12 +19,11 @@ from matplotlib.figure import Figure
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
-from advnerf_core.report.conditions import LIGHT
 from advnerf_core.report.evidence.families import GRADIENT
 from advnerf_core.report.evidence.verifying.layout import SET
+from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes, write_png
 from benchmarks.results import REPOSITORY, LedgerRow
-from benchmarks.run_folders import experiment_in
 from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import Bench
@@ -149,7 +148,7 @@ def main() -> None:
     )
     folder = parser.parse_args().folder
     if folder is not None:
-        write_atomically(KEPT, json.dumps(drives_of(experiment_in(folder.resolve()))) + "\n")
+        write_atomically(KEPT, json.dumps(drives_of(Experiment.resolved_in(folder.resolve()))) + "\n")
     found = read_json(KEPT)
     for row in ledger_rows():
         row.record()

@@ -25,7 +25,7 @@ from advnerf_core.policies.policy_file import load_policy
 from benchmarks import train_victims
 from benchmarks.results import record_row
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import deployed_drives
+from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.faces import PaintedScene
 from nodes.experiment.steps.run import load_experiment
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from advnerf_core.attack.closed_loop import ClosedLoopCosine
 from advnerf_core.attack.health import TickHealth, TimeSplit
-from advnerf_core.report.conditions import LIGHT
+from advnerf_core.report.palette import LIGHT
 
 
 def draw_health(

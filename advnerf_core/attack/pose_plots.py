@@ -16,7 +16,8 @@ from advnerf_core.attack.pose_maps import Landscape, RobustnessMap
 from advnerf_core.attack.spaces.placement import PoseSpace, footprint
 from advnerf_core.driving.path import Path
 from advnerf_core.geometry import Array, rotation_z
-from advnerf_core.report.conditions import LIGHT, style_of
+from advnerf_core.report.conditions import style_of
+from advnerf_core.report.palette import LIGHT
 
 _COLOURS = "magma"
 

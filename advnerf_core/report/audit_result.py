@@ -399,38 +399,8 @@ class AuditResult(StrictModel):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> AuditResult:
-        """Refuse conclusions that the rest of the result does not support."""
-        outcome, evidence = self.verdict.outcome, self.verdict.evidence
-        concluded = outcome != "cannot_judge"
-        trusted = self.fidelity is not None and self.fidelity.trusted
-        planted = self.planted is not None and self.planted.found
-        judged = [each.evidence for each in self.strongest.judgements] if self.strongest else []
-        checks = (
-            (
-                self.place.scale is not None or self.strongest is None,
-                "a judged object needs a known scale of the place",
-            ),
-            (
-                outcome not in ("found", "nothing_found") or self.judgement is not None,
-                f"{outcome} needs a judgement with the verdict's evidence",
-            ),
-            (
-                self.judgement is None or evidence == max(judged, key=_EVIDENCE.index),
-                "a verdict needs the strongest evidence that was judged",
-            ),
-            (
-                (outcome == "worse") == (self.against is not None and self.against.is_worse),
-                "worse needs the comparison in against, with a lower end above the margin; such a comparison has no other verdict",
-            ),
-            (
-                not concluded or evidence != "surrogate" or trusted,
-                "a verdict with surrogate evidence needs a trusted fidelity",
-            ),
-            (outcome != "nothing_found" or planted, "nothing_found needs a planted control that was found"),
-        )
-        for holds, text in checks:
-            if not holds:
-                raise ValueError(f"expected a consistent result: {text}")
+        for wrong in _contradictions(self):
+            raise ValueError(wrong)
         return self
 
     @property
@@ -443,6 +413,39 @@ class AuditResult(StrictModel):
         """The judgement behind the verdict; None if no object was judged."""
         judged = self.strongest.judgements if self.strongest else ()
         return next((each for each in judged if each.evidence == self.verdict.evidence), None)
+
+
+def _contradictions(result: AuditResult) -> list[str]:
+    """Conclusions that the rest of the result does not support."""
+    outcome, evidence = result.verdict.outcome, result.verdict.evidence
+    concluded = outcome != "cannot_judge"
+    trusted = result.fidelity is not None and result.fidelity.trusted
+    planted = result.planted is not None and result.planted.found
+    judged = [each.evidence for each in result.strongest.judgements] if result.strongest else []
+    checks = (
+        (
+            result.place.scale is not None or result.strongest is None,
+            "a judged object needs a known scale of the place",
+        ),
+        (
+            outcome not in ("found", "nothing_found") or result.judgement is not None,
+            f"{outcome} needs a judgement with the verdict's evidence",
+        ),
+        (
+            result.judgement is None or evidence == max(judged, key=_EVIDENCE.index),
+            "a verdict needs the strongest evidence that was judged",
+        ),
+        (
+            (outcome == "worse") == (result.against is not None and result.against.is_worse),
+            "worse needs the comparison in against, with a lower end above the margin; such a comparison has no other verdict",
+        ),
+        (
+            not concluded or evidence != "surrogate" or trusted,
+            "a verdict with surrogate evidence needs a trusted fidelity",
+        ),
+        (outcome != "nothing_found" or planted, "nothing_found needs a planted control that was found"),
+    )
+    return [f"expected a consistent result: {text}" for holds, text in checks if not holds]
 
 
 def audit_schema() -> dict[str, Any]:

@@ -21,8 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont  # comes with matplotlib
 
 from advnerf_core.data.video import read_video
-from advnerf_core.report.conditions import DARK, style_of
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import Film
+from advnerf_core.report.palette import DARK
 
 MAX_BYTES = 1_500_000
 _QUALITIES = (24, 28, 32, 36, 40, 44)  # constant rate factors: larger is smaller and worse
@@ -132,17 +133,21 @@ def read_clip(path: Path) -> Frames:
     return np.stack([frame for *_, frame in read_video(path)])
 
 
+def film_uri(file: Path) -> str:
+    """A film, which `write_clip` wrote, as a data URI."""
+    return _data_uri("video/mp4", file.read_bytes())
+
+
 def image_uri(image: Frames, quality: int | None = None) -> str:
     """An RGB image as a data URI: PNG, or JPEG of the given quality."""
     kind, options = ("png", []) if quality is None else ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, quality])
     _, encoded = cv2.imencode(
         f".{kind}", cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), options
     )
-    return data_uri(f"image/{kind}", encoded.tobytes())
+    return _data_uri(f"image/{kind}", encoded.tobytes())
 
 
-def data_uri(media_type: str, data: bytes) -> str:
-    """Content of a file as a data URI."""
+def _data_uri(media_type: str, data: bytes) -> str:
     return f"data:{media_type};base64,{base64.b64encode(data).decode()}"
 
 
@@ -181,14 +186,23 @@ def _panel(track: ClipTrack, step: int, rate_hz: float, off_track_m: float) -> F
     # Captions go on top: a player puts its controls over the bottom.
     canvas.paste(Image.fromarray(image), (0, _TITLE_PX + _STATUS_PX))
     cte = float(np.asarray(track.cte_m)[index])
-    draw, middle = ImageDraw.Draw(canvas), _TITLE_PX / 2 - 1
-    draw.rectangle((0, 0, 4, _TITLE_PX - 3), fill=style_of(track.condition).dark)
-    draw.text((11, middle), track.title, fill=DARK["ink"], font=_font(13, bold=True), anchor="lm")
-    if track.attack_id:
-        end = (canvas.width - 2, middle)
-        draw.text(end, track.attack_id, fill=DARK["muted"], font=_font(11), anchor="rm")
+    _draw_title(canvas, track)
     _draw_status(canvas, index / rate_hz, cte, off_track_m, track.note if step > index else "")
     return np.asarray(canvas)
+
+
+def _draw_title(canvas: Image.Image, track: ClipTrack) -> None:
+    draw = ImageDraw.Draw(canvas)
+    draw.rectangle((0, 0, 4, _TITLE_PX - 3), fill=style_of(track.condition).dark)
+    draw.text((11, _TITLE_PX / 2 - 1), track.title, fill=DARK["ink"], font=_font(13, bold=True), anchor="lm")
+    if track.attack_id:
+        draw.text(
+            (canvas.width - 2, _TITLE_PX / 2 - 1),
+            track.attack_id,
+            fill=DARK["muted"],
+            font=_font(11),
+            anchor="rm",
+        )
 
 
 def _draw_status(canvas: Image.Image, time_s: float, cte_m: float, off_track_m: float, note: str) -> None:

@@ -12,8 +12,9 @@ from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from advnerf_core.report.conditions import LIGHT, style_of
-from advnerf_core.report.data import Drives, Laps, Scene
+from advnerf_core.report.conditions import style_of
+from advnerf_core.report.data import Drives, Laps, Run, Scene
+from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import add_run_legend, end_style, new_axes, run_style
 
 Floats = NDArray[np.float64]
@@ -59,15 +60,7 @@ def trajectory_map(drives: Drives, victim: str, zoom: bool = True) -> Figure:
         for run in runs:
             ax.plot(run.states[:, 0], run.states[:, 1], **run_style(run))
             ax.plot(*run.states[-1, :2], **end_style(run))
-        # An arrow along the first heading of every start.
-        starts = {run.start: run.states[0] for run in reversed(runs)}
-        for start in sorted(starts):
-            x, y, yaw = starts[start]
-            arrow = {"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.2}
-            back = (x - 0.3 * np.cos(yaw), y - 0.3 * np.sin(yaw))
-            ax.annotate("", (x, y), back, zorder=3.5, annotation_clip=True, arrowprops=arrow)
-        if runs:
-            _note(ax, runs[0].states[0, :2], "start", (-14, 9))
+        _draw_starts(ax, runs)
         _frame(ax, box)
         if zoom:
             add_run_legend(ax, runs)
@@ -133,6 +126,22 @@ def _draw_face(ax: Any, segment: Floats, name: str) -> None:
     turn = float(np.degrees(np.arctan2(along[1], along[0])))
     text = {"va": "center", "size": 8.5, "rotation": turn, "rotation_mode": "anchor", "color": LIGHT["ink"]}
     _note(ax, middle, name, (away[0], away[1]), **text)
+
+
+def _draw_starts(ax: Any, runs: Sequence[Run]) -> None:
+    """An arrow along the first heading of every start."""
+    for start in sorted({r.start for r in runs}):
+        x, y, yaw = next(r.states[0] for r in runs if r.start == start)
+        ax.annotate(
+            "",
+            (x, y),
+            (x - 0.3 * np.cos(yaw), y - 0.3 * np.sin(yaw)),
+            zorder=3.5,
+            annotation_clip=True,
+            arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.2},
+        )
+    if runs:
+        _note(ax, runs[0].states[0, :2], "start", (-14, 9))
 
 
 def _note(ax: Any, at: Floats, text: str, offset_pt: tuple[float, float], **style: Any) -> None:

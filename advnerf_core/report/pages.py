@@ -11,8 +11,9 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from advnerf_core.report.conditions import look_css, style_of
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import Film
+from advnerf_core.report.palette import look_css
 
 HOW = "How it was run"
 # Films beyond this stay beside the page: browsers open a 20 MB page at once, but not a 200 MB page.
@@ -79,14 +80,10 @@ def fits(film: Film | None, room: int = MAX_EMBEDDED_BYTES) -> bool:
 
 def film_of(film: Film) -> dict[str, Any]:
     """A film for a template: its address, its poster at the largest deviation, and its size [px]."""
-    from advnerf_core.report.clips import data_uri, frame_of, image_uri  # video codecs and matplotlib
+    from advnerf_core.report.clips import film_uri, frame_of, image_uri  # video codecs and matplotlib
 
     still = frame_of(film.file, film.moment)
-    shown = {
-        "uri": data_uri("video/mp4", film.file.read_bytes()),
-        "poster": image_uri(still, quality=_QUALITY),
-        "titles": film.titles,
-    }
+    shown = {"uri": film_uri(film.file), "poster": image_uri(still, quality=_QUALITY), "titles": film.titles}
     return {**shown, "height": still.shape[0], "width": still.shape[1]}
 
 

@@ -19,8 +19,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from advnerf_core.files import write_atomically
-from advnerf_core.report.conditions import EMPTY, LIGHT, LINE_STYLES, NONE, order_of, style_of, themed_svg
+from advnerf_core.report.conditions import EMPTY, NONE, order_of, style_of
 from advnerf_core.report.data import Drives, Fidelity, Laps, Latency, Run
+from advnerf_core.report.palette import LIGHT, LINE_STYLES, themed_svg
 from advnerf_core.report.reference import Domain
 
 STYLE: dict[str, Any] = {

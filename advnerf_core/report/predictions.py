@@ -12,7 +12,8 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
-from advnerf_core.report.conditions import LIGHT, order_of, style_of
+from advnerf_core.report.conditions import order_of, style_of
+from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.text_table import Table
 
 if TYPE_CHECKING:

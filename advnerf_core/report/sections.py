@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from advnerf_core.report import maps, plots
-from advnerf_core.report.clips import image_uri
+from advnerf_core.report.clips import Frames, image_uri
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import SHOWN_VIEWS, Drives, ReportData
 from advnerf_core.report.pages import HOW, MAX_EMBEDDED_BYTES, fits, fragments
@@ -22,17 +22,13 @@ _DIFFERENCE_GAIN = 4
 
 def page_sections(data: ReportData, table: ResultTable) -> list[tuple[str, Markup]]:
     """Headings and HTML; parts that were not measured are named as such."""
-    seconds = data.manifest.timings
-    timings = [(name, number(wall_s, 1)) for name, wall_s in seconds.items()]
-    timings.append(("all stages", number(sum(seconds.values()), 1)))
-    stages = Table("Stages", ("stage", "wall time [s]"), tuple(timings), (False, True), (len(seconds),))
     drawn = fragments(
         "sections.html",
         data=data,
         image=lambda picture: image_uri(picture, quality=88),
         hops=_hop_table(data).html(),
         live_tries=_tries_table(table),
-        timings=stages.html(),
+        timings=_timing_table(data).html(),
         figures=_figures(data),
         textures=[(t, image_uri(t.image)) for t in data.textures],
         pairs_of_views=_views(data),
@@ -110,13 +106,14 @@ def _views(data: ReportData) -> list[dict[str, Any]]:
     out: list[dict[str, Any]] = []
     for view in data.fidelity.views if data.fidelity else ():
         if view.real is not None and view.surrogate is not None and len(out) < SHOWN_VIEWS:
-            apart = np.abs(view.real.astype(np.int16) - view.surrogate.astype(np.int16)).mean(
-                axis=2, keepdims=True
-            )
-            apart = np.repeat(np.clip(_DIFFERENCE_GAIN * apart, 0, 255).astype(np.uint8), 3, axis=2)
-            images = view.real, view.surrogate, apart
+            images = view.real, view.surrogate, _difference(view.real, view.surrogate)
             out.append({"view": view, "images": [image_uri(each) for each in images]})
     return out
+
+
+def _difference(a: Frames, b: Frames) -> Frames:
+    difference = np.abs(a.astype(np.int16) - b.astype(np.int16)).mean(axis=2, keepdims=True)
+    return np.repeat(np.clip(_DIFFERENCE_GAIN * difference, 0, 255).astype(np.uint8), 3, axis=2)
 
 
 def _fidelity_numbers(data: ReportData) -> Markup:
@@ -153,3 +150,11 @@ def _tries_table(table: ResultTable) -> Table:
         cells.append((*named, driven, str(len(spoiled)), "; ".join(spoiled)))
     columns = ("object shows", "policy", "seed", "driven live", "spoiled tries", "why they do not count")
     return Table("Live drives", columns, tuple(cells), (False, False, True, False, True, False))
+
+
+def _timing_table(data: ReportData) -> Table:
+    """Wall time of the stages and their sum."""
+    timings = data.manifest.timings
+    cells = [(name, number(wall_s, 1)) for name, wall_s in timings.items()]
+    cells.append(("all stages", number(sum(timings.values()), 1)))
+    return Table("Stages", ("stage", "wall time [s]"), tuple(cells), (False, True), (len(cells) - 1,))

@@ -116,11 +116,7 @@ def _target(
         # A car that ran into something went no farther off.
         if row.excess is not None and row.excess.collided:
             text += f", collided: {collisions(row.excess.collided)}"
-    if limit.above:
-        wanted = f"> {limit.above}" + ("" if bound is None else f" {bound:.2f}")
-    else:
-        wanted = f"{'≤' if limit.at_most is not None else '≥'} {bound:g}{measure.unit}"
-    return Target(_what(limit), wanted, value, text, met, verdict, limit.paper)
+    return Target(_what(limit), _limit_text(limit, bound), value, text, met, verdict, limit.paper)
 
 
 def _what(limit: Limit) -> str:
@@ -130,6 +126,13 @@ def _what(limit: Limit) -> str:
     scenario = f"{limit.scenario}, " if limit.scenario else ""
     victim = "" if limit.victim == "hardened" else f", victim {limit.victim}"
     return f"{scenario}{style_of(limit.method).title}{victim}, {limit.domain}: {title}"
+
+
+def _limit_text(limit: Limit, bound: float | None) -> str:
+    unit = _MEASURES[limit.of].unit
+    if limit.above:
+        return f"> {limit.above}" + ("" if bound is None else f" {bound:.2f}")
+    return f"{'≤' if limit.at_most is not None else '≥'} {bound:g}{unit}"
 
 
 def target_table(targets: Sequence[Target]) -> Table:

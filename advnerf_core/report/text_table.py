@@ -55,16 +55,22 @@ class Table:
         head = Markup("").join(
             Markup('<th scope="col"{}>{}</th>').format(self._align(i), c) for i, c in enumerate(self.columns)
         )
-        body = Markup("")
-        for index, row in enumerate(self.rows):
-            names = [self.classes[index]] if index < len(self.classes) and self.classes[index] else []
-            names += ["group"] if index in self.groups else []
-            named = Markup(' class="{}"').format(" ".join(names)) if names else ""
-            cells = (Markup("<td{}>{}</td>").format(self._align(i), cell) for i, cell in enumerate(row))
-            body += Markup("<tr{}>{}</tr>").format(named, Markup("").join(cells))
+        body = Markup("").join(self._html_row(i, row) for i, row in enumerate(self.rows))
         return Markup(
             '<div class="scroll"><table><thead><tr>{}</tr></thead><tbody>{}</tbody></table></div>'
         ).format(head, body)
+
+    def _html_row(self, index: int, row: Sequence[str]) -> Markup:
+        names = [self.classes[index]] if index < len(self.classes) and self.classes[index] else []
+        names += ["group"] if index in self.groups else []
+        cells = Markup("").join(
+            Markup("<td{}>{}</td>").format(self._align(i), cell) for i, cell in enumerate(row)
+        )
+        return (
+            Markup('<tr class="{}">{}</tr>').format(" ".join(names), cells)
+            if names
+            else Markup("<tr>{}</tr>").format(cells)
+        )
 
     def _align(self, column: int) -> Markup:
         return Markup(' class="number"') if self.right[column] else Markup("")

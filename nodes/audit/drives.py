@@ -21,7 +21,7 @@ from hardware.worlds.world import World
 from nodes.audit.question import VICTIM
 from nodes.audit.verdict import ArmDrives
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import deployed_drives, learned_drives
+from nodes.experiment.show.drives import deployed_drives, learned_drives
 from nodes.experiment.show.learned_scene import HELD_OUT, captured
 from nodes.experiment.show.spaces import colour_space, dress, shown_there
 from nodes.experiment.show.victims import load_victim

@@ -17,7 +17,7 @@ from scipy.stats import binomtest
 
 from advnerf_core.driving.metrics import DriveMetrics
 from advnerf_core.report.audit_result import AuditEffect, Control
-from advnerf_core.report.evidence.intervals import one_sample
+from advnerf_core.report.evidence.mean_estimate import one_sample
 
 Floats = NDArray[np.float64]
 LEVEL = 0.95

@@ -44,7 +44,7 @@ def demo(
 def _run(folder: Path, port: int | None) -> None:
     from nodes.cli.cell_choice import CellChoice, load_cells
     from nodes.cli.experiment import say_wrong
-    from nodes.experiment.pages.report import setting_lines
+    from nodes.experiment.pages.setting import setting_lines
     from nodes.experiment.run.run import Options
     from nodes.experiment.run.whole import run_experiment
     from nodes.experiment_page.page import run_with_page, user_browser

@@ -223,7 +223,7 @@ def maps(
     ] = None,
 ) -> None:
     """Draw the loss landscape and the robustness map (starts x moves of an object) of finished cells that have placed objects."""
-    from nodes.experiment.run.plan import map_cells
+    from nodes.experiment.run.maps import map_cells
 
     experiment, cells = load_cells(choice)
     for picture in map_cells(experiment, cells, number):

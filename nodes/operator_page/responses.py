@@ -6,7 +6,7 @@ from collections.abc import Callable
 from importlib.resources import files
 from typing import Any
 
-from advnerf_core.report.conditions import look_css
+from advnerf_core.report.palette import look_css
 from nodes.operator_page.doors import host_is_ours
 from nodes.operator_page.said import LONGEST_BYTES
 

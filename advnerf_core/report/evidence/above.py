@@ -18,12 +18,13 @@ from PIL import Image
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically
-from advnerf_core.report.conditions import LIGHT, NONE, style_of
+from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.about import ObjectPlace, read_about
 from advnerf_core.report.evidence.page import above_of, film_of, filmed_of, has_stills, maps_of
 from advnerf_core.report.evidence.results import Evidence, read_evidence
 from advnerf_core.report.evidence.rows import Key
 from advnerf_core.report.evidence.verifying.layout import SET
+from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import STYLE
 
 Floats = NDArray[np.float64]
@@ -194,10 +195,7 @@ def _draw_map(
         corners += [middle - 0.7 * place.width_m, middle + 0.7 * place.width_m]
     box = ax.get_position()
     shape = box.width * _SIZE_IN[0] / (box.height * _SIZE_IN[1])
-    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
-    # As wide as the axes for its height.
-    size = np.maximum(high - low, [shape * (high - low)[1], (high - low)[0] / shape])
-    low, high = 0.5 * (low + high) - 0.5 * size, 0.5 * (low + high) + 0.5 * size
+    low, high = _in_shape(np.min(corners, axis=0), np.max(corners, axis=0), shape)
     ax.set(
         xlim=(low[0], high[0]),
         ylim=(low[1], high[1]),
@@ -206,6 +204,13 @@ def _draw_map(
         title="every deployed drive from above; dots: where it ends",
     )
     ax.set_aspect("equal")
+
+
+def _in_shape(low: Floats, high: Floats, shape: float) -> tuple[Floats, Floats]:
+    """Corners of a box around another one, whose width is ``shape`` times its height."""
+    size = np.maximum(high - low, [shape * (high - low)[1], (high - low)[0] / shape])
+    middle = 0.5 * (low + high)
+    return middle - 0.5 * size, middle + 0.5 * size
 
 
 def _width(group: DriveGroup) -> float:

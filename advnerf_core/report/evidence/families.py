@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 
-from advnerf_core.report.conditions import style_of
+from advnerf_core.report.conditions import CONTROLS, style_of
 from advnerf_core.report.evidence.registration import RegisteredScenario, Registration
 
 RANDOM_FAMILIES = ("random", "random_coarse", "random_levels", "random_pink", "random_natural")
@@ -62,10 +62,14 @@ def _note(registration: Registration, key: str) -> str:
     scenario = registration.scenarios[key]
     if scenario.space.get("kind") in RANDOM_ALONE:
         return "*Baseline*: random places or shapes, with as many evaluations."
-    ran = {cell.method for cell in registration.cells if cell.scenario == key}
-    marks = list(_marks(against, ran, scenario))
+    marks = list(_marks(against, _methods(registration, key), scenario))
     verdict = f" **{'; '.join(marks)}.**" if marks else ""
     return f"*Baselines*: {', '.join(style_of(name).title for name in against)}, each with as many evaluations as the attack.{verdict}"
+
+
+def _methods(registration: Registration, key: str) -> set[str]:
+    cells = [cell for cell in registration.cells if cell.scenario == key]
+    return {cell.method for cell in cells if cell.method not in CONTROLS}
 
 
 def _marks(against: Sequence[str], ran: Collection[str], scenario: RegisteredScenario) -> Iterator[str]:

@@ -18,6 +18,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_json
 from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.strict import StrictModel
 
@@ -174,6 +175,11 @@ def read_hardness(file: Path) -> HardnessRecord:
         ) from None
 
 
+def write_hardness(file: Path, record: HardnessRecord) -> None:
+    """Write a record of verdicts."""
+    write_json(file, record.model_dump(mode="json"))
+
+
 def merged(records: Iterable[HardnessRecord]) -> HardnessRecord:
     """One record of all verdicts.
 
@@ -198,14 +204,8 @@ def victim_title(
     if not any(verdict.passed for verdict in record.verdicts):
         return TRAINED_WITH_TEXTURES
     searched = [cell for cell in cells if cell.victim == victim and cell.method.startswith("gradient")]
-    for cell in searched:
-        # A verdict of its policy, on other families than the baselines, that existed before its search began.
-        verdict = record.passing(cell.policy_sha256)
-        if verdict is None or cell.extra.get("hardness") != verdict.digest:
-            return TRAINED_WITH_TEXTURES
-        if {*verdict.trained_on, *verdict.validated_on} & {*baselines}:
-            return TRAINED_WITH_TEXTURES
-    return HARDENED if searched else TRAINED_WITH_TEXTURES
+    judged = bool(searched) and all(_judged_before(cell, record, baselines) for cell in searched)
+    return HARDENED if judged else TRAINED_WITH_TEXTURES
 
 
 def titles_of(folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
@@ -214,8 +214,10 @@ def titles_of(folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
     baselines = {name for test in data["primary"] for name in test["test"]["against"]}
     names = {row["victim"] for row in data["rows"]}
 
-    files = sorted(folder.glob("*.json"))
-    return {name: victim_title(name, map(read_cell, files), record, baselines) for name in sorted(names)}
+    def title(name: str) -> str:
+        return victim_title(name, map(read_cell, sorted(folder.glob("*.json"))), record, baselines)
+
+    return {name: title(name) for name in sorted(names)}
 
 
 def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
@@ -229,3 +231,11 @@ def with_titles(folder: Path, data: Mapping[str, Any]) -> dict[str, Any]:
 
     found: dict[str, Any] = titled(data)
     return found
+
+
+def _judged_before(cell: CellResult, record: HardnessRecord, baselines: Collection[str]) -> bool:
+    """Whether a passing verdict of the cell's policy, on other families than the baselines, existed before its search began."""
+    verdict = record.passing(cell.policy_sha256)
+    if verdict is None or cell.extra.get("hardness") != verdict.digest:
+        return False
+    return not {*verdict.trained_on, *verdict.validated_on} & {*baselines}

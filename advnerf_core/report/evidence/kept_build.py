@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.report.evidence.registration import read_registration
+from advnerf_core.report.evidence.registration import Registration, read_registration
 
 # Folder of the published stages, beside the sets; each has its record. Files of existing policies lie beside the stages, as ``VICTIM``.
 BUILD, RECORD, VICTIM = "reference", "stage.json", "victim"
@@ -16,16 +17,9 @@ LOST = "cannot be driven again: its scene or victim was not kept"
 
 def is_kept(folder: Path) -> bool:
     """Whether the reference build beside a set has the scene and the victims of every scenario of it."""
+    registration = read_registration(folder)
     kept = {digest for file in (folder.parent / BUILD).glob(f"*/{RECORD}") if (digest := _digest_in(file))}
-    # Of the first cell of every victim in a scenario: `verify` checks that the others are equal.
-    cells = registration.cells if (registration := read_registration(folder)) is not None else ()
-    first = {(cell.scenario, cell.victim): cell.name for cell in reversed(cells)}
-    files = [file for name in first.values() if (file := folder / f"{name}.json").exists()]
-    used: list[str | None] = []
-    for cell in map(read_json, files):
-        # A victim with a recipe of its own has a stage of its own, policy-NAME; an existing one has no stage, and is there as its files.
-        stages = {name.partition("-")[0]: digest for name, digest in cell.get("stages", {}).items()}
-        used += [stages.get("scene"), stages.get("policy") or cell.get("policy_sha256")]
+    used = _digests_used(folder, registration) if registration is not None else []
     return bool(used) and all(digest in kept for digest in used)
 
 
@@ -53,3 +47,17 @@ def _digest_in(record: Path) -> str | None:
         return read_json(record).get("digest")
     except (AdvnerfError, AttributeError):
         return None
+
+
+def _digests_used(folder: Path, registration: Registration) -> list[str | None]:
+    """Digests of scene and victim, of the first cell of every victim in a scenario: `verify` checks that the others are equal."""
+    first = {(cell.scenario, cell.victim): cell.name for cell in reversed(registration.cells)}
+    files = [file for name in first.values() if (file := folder / f"{name}.json").exists()]
+    return [digest for file in files for digest in _digests_of(read_json(file))]
+
+
+def _digests_of(cell: dict[str, Any]) -> tuple[str | None, str | None]:
+    """Digests of scene and victim; an existing victim has no stage, and is there as its files."""
+    # A victim with a recipe of its own has a stage of its own, policy-NAME.
+    stages = {name.partition("-")[0]: digest for name, digest in cell.get("stages", {}).items()}
+    return stages.get("scene"), stages.get("policy") or cell.get("policy_sha256")

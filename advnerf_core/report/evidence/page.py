@@ -123,12 +123,7 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
         _where(data["deployed_through"]),
         *data.get("notes", ()),
         *_withdrawn(data),
-        # Victims that break the registered rule.
-        *(
-            f"**Does not drive well:** past the plain object, the victim {row['victim']} has a mean abs. CTE of {row['mean_cte_m']:.4f} m {row['domain']} in "
-            f"{place_of(row)}, and {row['off_track']} drives leave the track. Registered were at most {row['limit_m']:.4f} m, and none. {row['reason']}\n"
-            for row in data.get("does_not_drive_well", [])
-        ),
+        *_drives_badly(data),
     ]
     if data["primary"]:
         apart = searched_apart(data["primary"])
@@ -137,11 +132,10 @@ def _section(name: str, sets: Mapping[str, Mapping[str, Any]]) -> str:
         parts += [*(f"{each}\n" for each in said), _tests(data["primary"])]
     parts += [_table(registered), f"![Excess of every drive, by method and domain]({picture_of(name)})\n"]
     if data["filmed"]:
-        filmed = filmed_of(data)["test"]
         baseline = ["the strongest baseline"] if filmed_of(data)["baseline"] else []
         parts.append(
             f"![Drives past {', '.join(['the plain object', *baseline])} and the attack]({film_of(name)})\n\n"
-            f"*Film: {place_of(filmed)}{'' if data['primary'] else ', victim ' + filmed['victim']}.*\n"
+            f"*Film: {_filmed(data)}.*\n"
         )
     if data.get("contrasts"):
         parts += ["### What each difference costs\n", _contrasts(data["contrasts"])]
@@ -169,14 +163,7 @@ def maps_of(data: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
     if data["primary"]:
         return [[test] for test in searched_apart(data["primary"])]
     if not data.get("claims"):
-        # In the form of tests, each with the difference to the one before.
-        found = dict[str, Mapping[str, Any]]()
-        for row in data.get("contrasts", ()):
-            of_row = {"victim": row["victim"], "method": row["method"]}
-            for end, difference_m in (("before", 0.0), ("after", row["difference_m"])):
-                test = {"scenario": row[end], **of_row}
-                found.setdefault(row[end], {"test": test, "baseline": None, "difference_m": difference_m})
-        return [[condition] for condition in found.values()]
+        return [[condition] for condition in _conditions(data)]
     maps = dict[str, list[Mapping[str, Any]]]()
     for claimed in data.get("claims", ()):
         for each in claimed["each"]:
@@ -190,12 +177,28 @@ def has_stills(data: Mapping[str, Any]) -> bool:
     return bool(data["primary"]) and len(maps_of(data)) == 1
 
 
+def _conditions(data: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The conditions that contrasts compare, in the form of tests, each with the difference to the one before."""
+    found = dict[str, Mapping[str, Any]]()
+    for row in data.get("contrasts", ()):
+        of_row = {"victim": row["victim"], "method": row["method"]}
+        for end, difference_m in (("before", 0.0), ("after", row["difference_m"])):
+            test = {"scenario": row[end], **of_row}
+            found.setdefault(row[end], {"test": test, "baseline": None, "difference_m": difference_m})
+    return list(found.values())
+
+
 def filmed_of(data: Mapping[str, Any]) -> Mapping[str, Any]:
     """The test from ``set.json`` whose drives are filmed: the first one; of scenarios with searches of their own the one with the largest difference."""
     apart = [test for tests in maps_of(data) for test in tests]
     if len(apart) > 1:
         return max(apart, key=lambda test: test["difference_m"] or 0.0)
     return (data["primary"] or apart)[0]
+
+
+def _filmed(data: Mapping[str, Any]) -> str:
+    test = filmed_of(data)["test"]
+    return place_of(test) + ("" if data["primary"] else f", victim {test['victim']}")
 
 
 def _picture(name: str, data: Mapping[str, Any]) -> list[str]:
@@ -253,6 +256,15 @@ def _withdrawn(data: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
+def _drives_badly(data: Mapping[str, Any]) -> list[str]:
+    """Sentences about victims that break the registered rule of driving well."""
+    return [
+        f"**Does not drive well:** past the plain object, the victim {row['victim']} has a mean abs. CTE of {row['mean_cte_m']:.4f} m {row['domain']} in "
+        f"{place_of(row)}, and {row['off_track']} drives leave the track. Registered were at most {row['limit_m']:.4f} m, and none. {row['reason']}\n"
+        for row in data.get("does_not_drive_well", [])
+    ]
+
+
 def _tests(tests: Sequence[Mapping[str, Any]]) -> str:
     """The primary tests: deployed excess of the attack minus the baseline's."""
     return _lines(
@@ -266,13 +278,21 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> str:
                 "95 %": ends(test["low_m"], test["high_m"]),
                 "p deployed, after Holm": "not tested" if test["p"] is None else p_text(test["p_holm"]),
                 "in the learned scene": f"{test['difference_surrogate_m']:+.3f}",
-                "p there, not adjusted": "" if test["p_surrogate"] is None else p_text(test["p_surrogate"]),
-                # Search pairs after which the anytime-valid test would have decided.
-                "decided after": f"{test['anytime']['pairs'] or '-'} of {test['anytime']['of_pairs']} pairs",
+                "p there, not adjusted": _optional_p(test["p_surrogate"]),
+                "decided after": _decided(test["anytime"]),
             }
             for test in tests
         ]
     )
+
+
+def _decided(found: Mapping[str, Any]) -> str:
+    """Number of search pairs after which the anytime-valid test would have decided."""
+    return f"{found['pairs'] or '-'} of {found['of_pairs']} pairs" if found["of_pairs"] else ""
+
+
+def _optional_p(value: float | None) -> str:
+    return "" if value is None else p_text(value)
 
 
 def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:

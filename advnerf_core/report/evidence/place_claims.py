@@ -21,6 +21,24 @@ from advnerf_core.report.reference import DOMAINS, Domain
 
 
 @dataclass(frozen=True)
+class PlaceDifference:
+    """What the method does at one place to one victim, minus what the baseline does there; deployed.
+
+    Attributes:
+        scenario: The place.
+        baseline: The baseline that is strongest in the learned scene.
+        difference_m: Difference of the mean excess |CTE| per tick [m].
+        off_track_points: Difference of the shares of drives off the track [percentage points].
+    """
+
+    scenario: str
+    victim: str
+    baseline: str
+    difference_m: float
+    off_track_points: float
+
+
+@dataclass(frozen=True)
 class PlaceClaimRow:
     """The result of a claim.
 
@@ -34,7 +52,7 @@ class PlaceClaimRow:
         least_off_track_points: The smallest of these differences.
         places: Number of places.
         victims: Number of victims.
-        each: The values that the means are of, as `_difference` names them.
+        each: The values that the means are of.
         reason: Reason for a claim that cannot be made.
     """
 
@@ -71,7 +89,8 @@ def place_claim_row(evidence: Evidence, claim: PlaceClaim) -> PlaceClaimRow:
         for victim in claim.victims
     ]
     values_m, points = (
-        np.reshape([one[name] for one in each], shape) for name in ("difference_m", "off_track_points")
+        np.reshape([getattr(one, name) for one in each], shape)
+        for name in ("difference_m", "off_track_points")
     )
     interval, of_points = (
         clustered_interval(list(values), evidence.registration.level) for values in (values_m, points)
@@ -84,7 +103,7 @@ def place_claim_row(evidence: Evidence, claim: PlaceClaim) -> PlaceClaimRow:
         *shape,
         *(interval.mean, interval.low, interval.high),
         *(of_points.mean, max(of_points.low, -100.0) if np.ptp(points) else None, float(points.min())),
-        each=tuple(each),
+        each=tuple(vars(one) for one in each),
     )
 
 
@@ -103,11 +122,8 @@ def _missing(evidence: Evidence, claim: PlaceClaim) -> str:
     return ""
 
 
-def _difference(evidence: Evidence, claim: PlaceClaim, scenario: str, victim: str) -> dict[str, Any]:
-    """What the method does at one place to one victim, minus what the baseline that is strongest in the learned scene does there; deployed.
-
-    ``difference_m`` is of the mean excess |CTE| per tick [m], ``off_track_points`` of the shares of drives off the track [percentage points].
-    """
+def _difference(evidence: Evidence, claim: PlaceClaim, scenario: str, victim: str) -> PlaceDifference:
+    """The values of one place and victim."""
 
     def searches(method: str) -> list[CellResult]:
         found = evidence.searches((scenario, victim, method))
@@ -121,10 +137,10 @@ def _difference(evidence: Evidence, claim: PlaceClaim, scenario: str, victim: st
         return float(np.mean([drive.off_track for drive in drives]))
 
     baseline = max(claim.against, key=lambda method: excess_m(method, "surrogate"))
-    return {
-        "scenario": scenario,
-        "victim": victim,
-        "baseline": baseline,
-        "difference_m": excess_m(claim.method, "deployed") - excess_m(baseline, "deployed"),
-        "off_track_points": 100.0 * (off_track(claim.method) - off_track(baseline)),
-    }
+    return PlaceDifference(
+        scenario,
+        victim,
+        baseline,
+        excess_m(claim.method, "deployed") - excess_m(baseline, "deployed"),
+        100.0 * (off_track(claim.method) - off_track(baseline)),
+    )

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from advnerf_core.report.conditions import LIGHT, NONE, style_of
+from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.evidence.results import Evidence, rows
 from advnerf_core.report.evidence.rows import Row
 from advnerf_core.report.evidence.words import DOMAIN_TITLES
+from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes
 
 _MOST_COLUMNS = 8

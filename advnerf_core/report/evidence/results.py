@@ -15,7 +15,7 @@ from advnerf_core.report.cells import CellResult, read_cells
 from advnerf_core.report.conditions import CONTROLS, NONE
 from advnerf_core.report.evidence.anytime import AnytimeTest, anytime_test
 from advnerf_core.report.evidence.exact import McNemar, holm, mcnemar_per_search, permutation_test
-from advnerf_core.report.evidence.intervals import difference_interval
+from advnerf_core.report.evidence.intervals import ClusteredInterval, difference_interval
 from advnerf_core.report.evidence.registration import (
     PrimaryTest,
     RegisteredScenario,
@@ -109,7 +109,10 @@ class Evidence(CellDrives):
         """Metrics of the drives of a cell, computed from their published poses."""
         key = cell.name, domain
         if key not in self._metrics:
-            path, horizon = self._paths[cell.scenario], self.scenario_of(cell).horizon
+            path, horizon = (
+                self._paths[cell.scenario],
+                self.scenario_of(cell).horizon,
+            )
             drives = cell.kept.get(domain, ())
             stopped = [drive.driven_ticks for drive in drives]
             self._metrics[key] = metrics_of_drives(
@@ -175,23 +178,27 @@ def primary_tests(evidence: Evidence) -> list[TestResult]:
 
 def as_data(evidence: Evidence) -> dict[str, Any]:
     """All published numbers as JSON data."""
-    keys = ("victim", "method", "seed", "attack_id")
-    searched = {
-        (cell.victim, cell.method, cell.seed, cell.attack_id or "")
-        for cell in evidence.cells.values()
-        if cell.method not in CONTROLS
-    }
     through = {str(cell.extra.get("deployed_through", "simulation")) for cell in evidence.cells.values()}
     return {
         "deployed_through": sorted(through),
-        # Each once: several conditions, and other sets, may have driven the result of one search.
-        "searches": [dict(zip(keys, each, strict=True)) for each in sorted(searched)],
+        "searches": search_list(evidence),
         "rows": [vars(row) for row in rows(evidence)],
         "primary": [
             {**asdict(test), "test": test.test.model_dump(mode="json", exclude={"placement"})}
             for test in primary_tests(evidence)
         ],
     }
+
+
+def search_list(evidence: Evidence) -> list[dict[str, Any]]:
+    """The searches of a set, each once: several conditions, and other sets, may have driven the result of one search."""
+    found = {
+        (cell.victim, cell.method, cell.seed, cell.attack_id or "")
+        for cell in evidence.cells.values()
+        if cell.method not in CONTROLS
+    }
+    keys = ("victim", "method", "seed", "attack_id")
+    return [dict(zip(keys, each, strict=True)) for each in sorted(found)]
 
 
 def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
@@ -210,15 +217,8 @@ def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
     two = (test.method, baseline)
     (searched, theirs), (deployed, against) = ([means(name, domain) for name in two] for domain in DOMAINS)
     found, there = permutation_test(deployed, against), permutation_test(searched, theirs)
-    # Searches of two methods, from the same starts.
-    one, other = ([evidence.excesses_m(cell, "deployed") for cell in by_method[name]] for name in two)
-    alike = len({len(each) for each in (*one, *other)}) == 1
-    level = evidence.registration.level
-    interval = difference_interval(np.array(one), np.array(other), level) if alike else None
-    off = [
-        [[outcome.off_track for outcome in evidence.outcomes(cell, "deployed")] for cell in by_method[name]]
-        for name in two
-    ]
+    interval = _difference(evidence, by_method[test.method], by_method[baseline])
+    off = [_off_track(evidence, by_method[name]) for name in two]
     return TestResult(
         test,
         baseline,
@@ -236,6 +236,16 @@ def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
     )
 
 
+def _difference(
+    evidence: Evidence, method: Sequence[CellResult], baseline: Sequence[CellResult]
+) -> ClusteredInterval | None:
+    """Interval of the difference in deployed excess: searches of two methods, from the same starts."""
+    one, other = ([evidence.excesses_m(cell, "deployed") for cell in cells] for cells in (method, baseline))
+    if len({len(each) for each in (*one, *other)}) != 1:
+        return None
+    return difference_interval(np.array(one), np.array(other), evidence.registration.level)
+
+
 def _search_means(evidence: Evidence, cell: CellResult) -> SearchMeans:
     clean = evidence.without(cell)
     assert clean is not None, "without it there is no outcome"
@@ -248,3 +258,7 @@ def _search_means(evidence: Evidence, cell: CellResult) -> SearchMeans:
 def mean_excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> float:
     """Mean excess |CTE| per tick of a cell's drives [m]; the cell must have some in this domain."""
     return float(np.mean(evidence.excesses_m(cell, domain)))
+
+
+def _off_track(evidence: Evidence, cells: Sequence[CellResult]) -> list[list[bool]]:
+    return [[outcome.off_track for outcome in evidence.outcomes(cell, "deployed")] for cell in cells]

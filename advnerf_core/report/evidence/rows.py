@@ -165,8 +165,7 @@ def make_row(drives: CellDrives, key: Key, domain: Domain) -> Row | None:
     ]
     shared = drives.share_starts(cells, domain)
     interval = _interval(drives, values, shared)
-    bare = [drives.excesses_m(cell, domain, EMPTY) for cell in cells if cell.method != EMPTY]
-    bare = bare if all(bare) else []  # a cell has no drives to compare with
+    bare = _over_no_object_m(drives, cells, domain)
     bare_interval = _interval(drives, bare, shared) if bare else None
     flat = [outcome for found in outcomes for outcome in found]
     leaving = [outcome.time_to_leaving_s for outcome in flat if outcome.time_to_leaving_s is not None]
@@ -189,6 +188,12 @@ def make_row(drives: CellDrives, key: Key, domain: Domain) -> Row | None:
         leaving_s=float(np.median(leaving)) if leaving else None,
         registered=all(drives.is_registered(cell) for cell in cells),
     )
+
+
+def _over_no_object_m(drives: CellDrives, cells: Sequence[CellResult], domain: Domain) -> list[list[float]]:
+    """Excess of each drive over no object, by cell; empty if a cell has no drives to compare with, or is the control itself."""
+    found = [drives.excesses_m(cell, domain, EMPTY) for cell in cells if cell.method != EMPTY]
+    return found if all(found) else []
 
 
 def _mean(values: Sequence[Sequence[float]]) -> float:

@@ -7,6 +7,7 @@ here needs torch or a simulator. Each kind of check is a file in `verifying`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,18 +58,9 @@ def verify_set(folder: Path) -> Verified:
         missing = len(missing_cells(evidence, withdrawn))
         if missing and not (folder / SET).exists() and folder.name not in known_digests(folder.parent):
             # No number is claimed, but the cells that are there must be right.
-            of_cells = tuple(set_problems(folder, evidence, under_way=True))
-            return Verified(folder.name, 0, _drives(evidence), of_cells, awaits=missing)
-        problems = [*file_problems(folder), *set_problems(folder, evidence)]
-        numbers = 0
-        if not problems:  # numbers of damaged drives add nothing
-            numbers, problems = number_problems(folder, published_numbers(evidence, withdrawn, declared))
-        findings = tuple(
-            f"{row['scenario']} {row['victim']} does not drive well {row['domain']}: mean |CTE| {row['mean_cte_m']:.4f} m without "
-            f"attack, at most {row['limit_m']:.4f} m was registered; {row['off_track']} drives off the track"
-            for row in ([] if problems else drives_badly(evidence))
-        )
-        return Verified(folder.name, numbers, _drives(evidence), tuple(problems), findings)
+            problems = tuple(set_problems(folder, evidence, under_way=True))
+            return Verified(folder.name, 0, _drives(evidence), problems, awaits=missing)
+        return _verified(folder, evidence, withdrawn, declared)
     except _SENSELESS as error:
         return Verified(
             folder.name, 0, 0, (f"{folder}: cannot be computed again: {error!r}; restore it from git",)
@@ -77,6 +69,21 @@ def verify_set(folder: Path) -> Verified:
 
 def _drives(evidence: Evidence) -> int:
     return sum(len(kept) for cell in evidence.all_cells for kept in cell.kept.values())
+
+
+def _verified(
+    folder: Path,
+    evidence: Evidence,
+    withdrawn: Mapping[str, str],
+    declared: Mapping[str, str],
+) -> Verified:
+    problems = [*file_problems(folder), *set_problems(folder, evidence)]
+    numbers = 0
+    if not problems:  # numbers of damaged drives add nothing
+        numbers, problems = number_problems(folder, published_numbers(evidence, withdrawn, declared))
+    return Verified(
+        folder.name, numbers, _drives(evidence), tuple(problems), tuple(_findings(evidence, problems))
+    )
 
 
 def verify_beside(published: Path) -> tuple[str, ...]:
@@ -93,3 +100,13 @@ def verify_beside(published: Path) -> tuple[str, ...]:
     except (OSError, StopIteration, *_SENSELESS) as error:  # of damaged manifests
         problems.append(f"{page}: cannot be made from the published sets: {error!r}")
     return tuple(problems)
+
+
+def _findings(evidence: Evidence, problems: Sequence[str]) -> Iterator[str]:
+    if problems:
+        return
+    for row in drives_badly(evidence):
+        yield (
+            f"{row['scenario']} {row['victim']} does not drive well {row['domain']}: mean |CTE| {row['mean_cte_m']:.4f} m without "
+            f"attack, at most {row['limit_m']:.4f} m was registered; {row['off_track']} drives off the track"
+        )

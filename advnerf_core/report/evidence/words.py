@@ -99,20 +99,23 @@ def claim(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
     excess = smaller_excess(row)
     between = f" ({ends(excess.low_m, excess.high_m)} m)" if excess.low_m is not None else ""
     shown = "" if excess.is_shown else " The interval is not above zero: no effect is shown."
-    other = "Drives with no object were not made."
-    for each in excesses(row):
-        if each.over != excess.over:
-            other = f"Over {_the(each.over)} the excess is {each.mean_m:.3f} m."
     hit = f"; {collisions(row['collided'])} run into something" if row["collided"] else ""
     return (
         f"**{place_of(which)}, victim {which['victim']}, deployed.** With the {style_of(which['method']).title} attack the car is {excess.mean_m:.3f} m "
         f"per tick further from its path than with {_the(excess.over)}{between}, and {row['off_track']} of {row['drives']} drives leave the track{hit}.{shown} "
-        f"{other} {_against_baseline(test)}"
+        f"{_other_control(row, excess)} {_against_baseline(test)}"
     )
 
 
 def _the(control: str) -> str:
     return control if control == style_of(EMPTY).title else f"the {control}"
+
+
+def _other_control(row: Mapping[str, Any], used: Excess) -> str:
+    others = [each for each in excesses(row) if each.over != used.over]
+    if not others:
+        return "Drives with no object were not made."
+    return f"Over {_the(others[0].over)} the excess is {others[0].mean_m:.3f} m."
 
 
 def _against_baseline(test: Mapping[str, Any]) -> str:

@@ -62,12 +62,11 @@ def write_sarif(file: Path, result: AuditResult) -> None:
         )
         for rule, (name, says, advice) in _RULES.items()
     ]
-    sha256 = result.policy.sha256
     driver = ToolDriver(name="advnerf", version=result.versions.get("advnerf"), rules=rules)
     run = Run(
         tool=Tool(driver=driver),
         invocations=[Invocation(execution_successful=True, end_time_utc=result.date)],
-        artifacts=None if sha256 is None else [Artifact(location=_file(result), hashes={"sha-256": sha256})],
+        artifacts=_artifacts(result),
         results=[_result(result)],
     )
     log = Sarif(schema_uri=SCHEMA, runs=[run])
@@ -82,27 +81,38 @@ def _result(result: AuditResult) -> Result:
     text = " ".join((result.verdict.sentence, *result.verdict.reasons))
     # The same finding in the next audit of the same policy in the same place, even with other numbers.
     same = hashlib.sha256(f"{rule}\n{result.policy.path}\n{result.place.name}".encode()).hexdigest()
-    # The policy file; its name for a policy without a file.
-    where = Location(physical_location=PhysicalLocation(artifact_location=_file(result, index=0)))
-    if result.policy.sha256 is None:
-        name = LogicalLocation(fully_qualified_name=result.policy.path, kind="module")
-        where = Location(logical_locations=[name])
     return Result(
         rule_id=rule,
         rule_index=list(_RULES).index(rule),
         kind=_KINDS[result.verdict.outcome],
         level=level,
         message=Message(text=text),
-        locations=[where],
+        locations=[_location(result)],
         partial_fingerprints={"policyAndPlace/v1": same},
         properties=_properties(result),
     )
 
 
-def _file(result: AuditResult, index: int | None = None) -> ArtifactLocation:
-    """The policy file; a relative path stays relative, to the root of the repository."""
-    path = Path(result.policy.path)
-    return ArtifactLocation(uri=path.as_uri() if path.is_absolute() else quote(path.as_posix()), index=index)
+def _location(result: AuditResult) -> Location:
+    """The policy file; its name for a policy without a file."""
+    path = result.policy.path
+    if result.policy.sha256 is None:
+        return Location(logical_locations=[LogicalLocation(fully_qualified_name=path, kind="module")])
+    return Location(
+        physical_location=PhysicalLocation(artifact_location=ArtifactLocation(uri=_uri(path), index=0))
+    )
+
+
+def _artifacts(result: AuditResult) -> list[Any] | None:
+    if result.policy.sha256 is None:
+        return None
+    where = ArtifactLocation(uri=_uri(result.policy.path))
+    return [Artifact(location=where, hashes={"sha-256": result.policy.sha256})]
+
+
+def _uri(path: str) -> str:
+    """A file as a URI; a relative one stays relative, to the root of the repository."""
+    return Path(path).as_uri() if Path(path).is_absolute() else quote(Path(path).as_posix())
 
 
 def _properties(result: AuditResult) -> dict[str, Any]:

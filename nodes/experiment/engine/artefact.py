@@ -23,11 +23,13 @@ from pydantic import BaseModel
 from advnerf_core.documents import read_json
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_json
-from advnerf_core.report.evidence.kept_build import BUILD, RECORD
+from advnerf_core.report.evidence import kept_build
 from nodes.runtime.paths import shipped
 
+RECORD = kept_build.RECORD
 # Folders of cells and stages that are stored with the code.
 PUBLISHED = Path("docs/results")
+BUILD, VICTIM = kept_build.BUILD, kept_build.VICTIM
 _KEY_DIGITS = 16
 
 
@@ -125,7 +127,9 @@ def _digest_of(files: Mapping[str, Path]) -> str:
     digest = hashlib.sha256()
     for name in sorted(files, key=Path):
         digest.update(name.encode() + b"\0")
-        digest.update(files[name].read_bytes())
+        with files[name].open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
     return digest.hexdigest()
 
 
@@ -214,9 +218,7 @@ class ReferenceBuild:
         return None
 
     def _take(self, source: Path, found: Artefact, folder: Path) -> Artefact:
-        # Some of them may be stored in the folder of another stage.
-        shared = {name: source.with_name(other) / name for name, other in found.files_in.items()}
-        files = {**_files_in(source), **shared}
+        files = stored_files(source, found)
         if any(not file.exists() for file in files.values()) or _digest_of(files) != found.kept:
             raise ReferenceBuildError(
                 f"expected the files in {source} as they were kept, got others; restore them (git checkout -- {source.parent}), or remove the folder to "
@@ -271,6 +273,14 @@ class ReferenceBuild:
 
 
 REFERENCE = ReferenceBuild(PUBLISHED / BUILD, shipped(str(PUBLISHED / BUILD)))
+
+
+def stored_files(folder: Path, record: Artefact) -> dict[str, Path]:
+    """All files of a stage in a reference build, by their names in it, wherever they are stored."""
+    return {
+        **_files_in(folder),
+        **{name: folder.with_name(other) / name for name, other in record.files_in.items()},
+    }
 
 
 def _copy(files: Mapping[str, Path], target: Path, artefact: Artefact) -> None:

@@ -124,15 +124,20 @@ class ProgressRecord:
             if not part.text and part.fraction == 0.0:
                 part.first_fraction = fraction if fraction < 1.0 else 0.0
             part.fraction, part.text = fraction, text or part.text
-            if point is not None and isfinite(point.value):
-                curve = self._curves.setdefault(stage, {}).setdefault(point.curve, [])
-                # A stage that restarts, or resumes from a checkpoint, repeats steps.
-                while curve and curve[-1][0] >= point.step:
-                    curve.pop()
-                curve.append([round(point.step, 3), round(point.value, 4)])
-                if len(curve) > _POINTS:
-                    del curve[1:-1:2]
+            if point is not None:
+                self._add(stage, point)
         self._write()
+
+    def _add(self, stage: str, point: Point) -> None:
+        if not isfinite(point.value):
+            return
+        curve = self._curves.setdefault(stage, {}).setdefault(point.curve, [])
+        # A stage that restarts, or resumes from a checkpoint, repeats steps.
+        while curve and curve[-1][0] >= point.step:
+            curve.pop()
+        curve.append([round(point.step, 3), round(point.value, 4)])
+        if len(curve) > _POINTS:
+            del curve[1:-1:2]
 
     def _write(self, now: bool = False) -> None:
         with self._lock:

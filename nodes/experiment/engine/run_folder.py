@@ -135,9 +135,13 @@ class RunFolder:
         """
         return self.load_variant(cell.variant) if cell.variant and self.load_variant is not None else self
 
+    def config_of(self, cell: Cell) -> ExperimentConfig:
+        """The values of the variant that a cell belongs to, or of this experiment."""
+        return self.variants[cell.variant] if cell.variant else self.config
+
     def folder_of(self, cell: Cell) -> Path:
         """The run folder of the stages that a cell needs."""
-        return self._with_values(self.variants[cell.variant]).folder if cell.variant else self.folder
+        return self._with_values(self.config_of(cell)).folder if cell.variant else self.folder
 
     def _with_values(self, config: ExperimentConfig) -> Self:
         """A variant with these values, in its own run folder or in this one."""

@@ -104,17 +104,8 @@ def run_stages(
     whole = _read_whole(wanted, folder, reference)
     records: dict[str, Artefact] = {}
     for stage in wanted:
-        if missing := [name for name in stage.after if name not in records]:
-            raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
-        at, key, is_whole = folder / stage.name, key_of(stage, records), stage.name in whole
-        made = _finished(at, key, is_whole, display)
-        if made is None:
-            with _lock(at):
-                # The process that held the lock may have made exactly this. A reference build lacks intermediate files.
-                made = _finished(at, key, is_whole, display) or _go_on_or_begin(
-                    stage, at, key, records, display, None if is_whole else reference
-                )
-        records[stage.name] = made
+        at = _Place(folder / stage.name, reference, stage.name in whole)
+        records[stage.name] = _run_or_reuse(stage, at, records, display)
     return records
 
 
@@ -158,7 +149,8 @@ def outdated(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | 
         record = read_artefact(folder / stage.name)
         if record is None or record.digest is None:
             continue
-        if record.key not in _resumed(stage, records):
+        known = (stage.settings, *stage.resumes_from) if all(name in records for name in stage.after) else ()
+        if record.key not in [key_of(replace(stage, settings=each), records) for each in known]:
             found.append(stage.name)
     return found
 
@@ -168,13 +160,12 @@ def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Settings | N
     records = _current(stages, folder)
     stage = next(each for each in stages if each.name == name)
     record = read_artefact(folder / name)
-    return None if record is None else _resumed(stage, records).get(record.key)
-
-
-def _resumed(stage: Stage, records: Mapping[str, Artefact]) -> dict[str, Settings]:
-    """The settings of folders that running a stage goes on with, by their keys; none while stages that it builds on are not finished."""
-    known = (stage.settings, *stage.resumes_from) if all(name in records for name in stage.after) else ()
-    return {key_of(replace(stage, settings=each), records): each for each in known}
+    if record is None or any(earlier not in records for earlier in stage.after):
+        return None
+    known = (stage.settings, *stage.resumes_from)
+    return next(
+        (each for each in known if record.key == key_of(replace(stage, settings=each), records)), None
+    )
 
 
 def keep_stages(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild) -> list[Path]:
@@ -188,14 +179,38 @@ def keep_stages(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild
     return [each for each in found if each is not None]
 
 
-def _finished(folder: Path, key: str, whole: bool, display: StageDisplay) -> Artefact | None:
-    """The record of a folder with this key, finished; if its intermediate files are needed too, with these."""
-    record = read_artefact(folder)
+@dataclass(frozen=True)
+class _Place:
+    """Folder of a stage, a further place of its result, and whether its intermediate files are needed too."""
+
+    folder: Path
+    reference: ReferenceBuild | None
+    whole: bool
+
+
+def _run_or_reuse(
+    stage: Stage, at: _Place, records: Mapping[str, Artefact], display: StageDisplay
+) -> Artefact:
+    missing = [name for name in stage.after if name not in records]
+    if missing:
+        raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
+    key = key_of(stage, records)
+    if (old := _finished(at, key, display)) is not None:
+        return old
+    with _lock(at.folder):
+        # The process that held the lock may have made exactly this.
+        if (old := _finished(at, key, display)) is not None:
+            return old
+        return _go_on_or_begin(stage, at, key, records, display)
+
+
+def _finished(at: _Place, key: str, display: StageDisplay) -> Artefact | None:
+    record = read_artefact(at.folder)
     if record is None or record.key != key or record.digest is None:
         return None
-    if whole and record.kept is not None:
+    if at.whole and record.kept is not None:
         return None
-    display.finish(folder.name, record.seconds, cached=True)
+    display.finish(at.folder.name, record.seconds, cached=True)
     return record
 
 
@@ -211,24 +226,32 @@ def _lock(folder: Path) -> TextIO:
 
 
 def _go_on_or_begin(
-    stage: Stage,
-    folder: Path,
-    key: str,
-    records: Mapping[str, Artefact],
-    display: StageDisplay,
-    reference: ReferenceBuild | None,
+    stage: Stage, at: _Place, key: str, records: Mapping[str, Artefact], display: StageDisplay
 ) -> Artefact:
-    old = read_artefact(folder)
-    resumed = old is not None and old.kept is None and old.key in _resumed(stage, records)
-    if reference is not None and reference.find(stage.name, key) is not None:
+    folder, old = at.folder, read_artefact(at.folder)
+    parts = [key_of(replace(stage, settings=settings), records) for settings in stage.resumes_from]
+    resumed = old is not None and old.kept is None and old.key in (key, *parts)
+    if at.reference is not None and not at.whole and at.reference.find(stage.name, key) is not None:
         _require_ours(folder)
-        if (taken := reference.take(stage.name, key, folder)) is not None:
+        if (taken := at.reference.take(stage.name, key, folder)) is not None:
             display.finish(stage.name, taken.seconds, cached=True)
             return taken
     if not resumed and folder.exists():
         _require_ours(folder)
         shutil.rmtree(folder)
     earlier_s = old.seconds if resumed and old is not None else 0.0
+    return _run(stage, folder, key, earlier_s, display)
+
+
+def _require_ours(folder: Path) -> None:
+    """Raise instead of replacing files that no stage wrote."""
+    if folder.exists() and not (folder / RECORD).exists() and any(folder.iterdir()):
+        raise StageError(
+            f"expected {folder} to be a stage's folder, got files that no stage wrote; move them, or name another run folder"
+        )
+
+
+def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: StageDisplay) -> Artefact:
     folder.mkdir(parents=True, exist_ok=True)
     settings = stage.settings.resolved
     write_artefact(folder, Artefact(key, None, earlier_s, settings))
@@ -243,11 +266,3 @@ def _go_on_or_begin(
     write_artefact(folder, record)
     display.finish(stage.name, record.seconds, cached=False)
     return record
-
-
-def _require_ours(folder: Path) -> None:
-    """Raise instead of replacing files that no stage wrote."""
-    if folder.exists() and not (folder / RECORD).exists() and any(folder.iterdir()):
-        raise StageError(
-            f"expected {folder} to be a stage's folder, got files that no stage wrote; move them, or name another run folder"
-        )

@@ -6,11 +6,12 @@ import copy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from advnerf_core.attack.adjoint import AttackProblem, BlackBoxError, adjoint_gradient
+from advnerf_core.attack.adjoint import AdjointResult, AttackProblem, BlackBoxError, adjoint_gradient
 from advnerf_core.attack.closed_loop import ClosedLoopCosine, closed_loop_cosine
 from advnerf_core.attack.health import (
     TickHealth,
@@ -108,10 +109,7 @@ def check(request: Experiment, directions: int, memory: bool, report: Report) ->
     report(0.15, "finite differences with frozen poses")
     exact = in_double(prepared)
     along = random_directions(theta.double(), directions, prepared.seed)
-    reference = adjoint_gradient(exact, theta.double())
-    frozen = central_slopes(
-        partial(frozen_loss, exact, rollout=reference.rollout), theta.double(), along, _STEP
-    )
+    reference, frozen = _frozen_slopes(exact, theta.double(), along)
     closed = closed_loop_cosine(
         partial(closed_loss, exact),
         theta.double(),
@@ -148,6 +146,12 @@ def in_double(prepared: Prepared) -> AttackProblem:
     surrogate = prepared.space.surrogate.in_type(torch.float64).remembering(problem.cache_bytes)
     sensor = colour_space(prepared.experiment, surrogate).sensor
     return replace(problem, policy=policy, sensor=sensor, goals=goals)
+
+
+def _frozen_slopes(problem: AttackProblem, theta: Tensor, along: Tensor) -> tuple[AdjointResult, Any]:
+    reference = adjoint_gradient(problem, theta)
+    loss = partial(frozen_loss, problem, rollout=reference.rollout)
+    return reference, central_slopes(loss, theta, along, _STEP)
 
 
 def _memory(request: Experiment, report: Report) -> dict[int, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -53,20 +53,15 @@ def ask_for_attack(
         )
 
     with Bus(run_dir) as bus:
-        progress, heard_s = _ask(bus, "/attack/request", make), time.monotonic()
+        progress = _ask(bus, "/attack/request", make)
         tell(progress)
-        while follow and progress.state not in ENDED:
-            if time.monotonic() - heard_s >= _SILENCE_S:
-                raise LaunchError(
-                    f"the attack node has said nothing of this request for {_SILENCE_S:g} s; look into its log"
-                )
-            bus.wait(0.1)
-            for message in (received.message() for received in bus.receive()):
-                heard_s = time.monotonic()
-                if message.request_id == request_id and progress.state not in ENDED:
-                    progress = message
-                    tell(progress)
-        return progress
+        if not follow or progress.state in ENDED:
+            return progress
+        for progress in _progress(bus, request_id):
+            tell(progress)
+            if progress.state in ENDED:
+                return progress
+    raise AssertionError("unreachable: the progress ends with an error")
 
 
 def cancel_attack(run_dir: Path, request_id: str, reason: str) -> Any:
@@ -94,3 +89,17 @@ def _ask(bus: Bus, topic: str, make: Callable[[RequestIdentity, Now], Any]) -> A
         raise LaunchError(
             f"the attack node did not answer within {_ANSWER_S:g} s; is it running with the same --folder?"
         ) from None
+
+
+def _progress(bus: Bus, request_id: str) -> Iterator[Any]:
+    heard_s = time.monotonic()
+    while time.monotonic() - heard_s < _SILENCE_S:
+        bus.wait(0.1)
+        for received in bus.receive():
+            heard_s = time.monotonic()
+            message = received.message()
+            if message.request_id == request_id:
+                yield message
+    raise LaunchError(
+        f"the attack node has said nothing of this request for {_SILENCE_S:g} s; look into its log"
+    )

@@ -40,28 +40,43 @@ def mapped(experiment: Experiment, attack: Path | None) -> Mapped:
         AttackFileError: The file has other objects.
         PoseBoundsError: The objects stand outside their bounds.
     """
-    if not isinstance(experiment.config.space, PlacesConfig):
-        raise ConfigError(
-            f"{experiment.file}: expected space.kind places, with bounds of each object; see docs/poses.md"
-        )
+    _require_places(experiment)
     prepared = prepare(experiment)
     space = prepared.space
     assert isinstance(space, PlaceSpace), "the space of places is this one"
     found = None if attack is None else load_attack(attack)
     digest = hash_of([prepared.settings_hash, "" if found is None else found.sha256])
-    sensor, stand = space.sensor, space.sensor.space
-    if found is None:
-        unit = torch.where(stand.half > 0, (stand.nominal - stand.middle) / stand.half.clamp_min(1e-300), 0.0)
-        theta = sensor.join(unit, sensor.fixed_colours)
-    else:
-        colours = space.restored(found).colours.double().reshape(sensor.fixed_colours.shape)
-        if not sensor.free_colours and not torch.allclose(colours, sensor.fixed_colours):
-            raise ConfigError(
-                f"{attack}: expected the colours of the request (space.coloured_by, or plain ones), got others"
-            )
-        theta = sensor.join(stand.unit(_placements(found)), colours)
+    theta = _plain(space) if found is None else _theta_of(space, found, str(attack))
     return Mapped(prepared.problem, theta, digest, "" if found is None else "found")
+
+
+def _require_places(experiment: Experiment) -> None:
+    """Refuse a request that moves nothing.
+
+    Raises:
+        ConfigError: The request moves nothing.
+    """
+    if not isinstance(experiment.config.space, PlacesConfig):
+        raise ConfigError(
+            f"{experiment.file}: expected space.kind places, with bounds of each object; see docs/poses.md"
+        )
 
 
 def _placements(attack: AttackFile) -> Tensor:
     return torch.tensor([each.placement for each in attack.objects], dtype=torch.float64)
+
+
+def _plain(space: PlaceSpace) -> Tensor:
+    sensor, stand = space.sensor, space.sensor.space
+    unit = torch.where(stand.half > 0, (stand.nominal - stand.middle) / stand.half.clamp_min(1e-300), 0.0)
+    return sensor.join(unit, sensor.fixed_colours)
+
+
+def _theta_of(space: PlaceSpace, attack: AttackFile, file: str) -> Tensor:
+    sensor = space.sensor
+    colours = space.restored(attack).colours.double().reshape(sensor.fixed_colours.shape)
+    if not sensor.free_colours and not torch.allclose(colours, sensor.fixed_colours):
+        raise ConfigError(
+            f"{file}: expected the colours of the request (space.coloured_by, or plain ones), got others"
+        )
+    return sensor.join(sensor.space.unit(_placements(attack)), colours)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.artifact import AttackFile
@@ -18,7 +19,7 @@ from nodes.experiment.node.prepare import prepare
 from nodes.experiment.plan.placed import FLAT
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.own_scene import flat_object
-from nodes.experiment.steps.attack import past_field
+from nodes.experiment.steps.attack import Prepared, past_field
 from nodes.runtime.errors import ConfigError
 
 # The squash has no inverse at 0 and 1.
@@ -77,17 +78,36 @@ def print_effect(
     names = [thing.name for thing in request.objects]
     if name not in names or request.objects[names.index(name)].kind not in FLAT:
         raise ConfigError(f"{request.file}: expected a panel or cube named {name}, got {', '.join(names)}")
-    number = names.index(name)
+    shown = _with_print(request, attack, found, names.index(name), texture, scale, T_world_from_face)
+    clean_m, nominal_m, print_m = (_total_m(prepared, each) for each in (prepared.space.plain, found, shown))
+    return PrintEffect(clean_m, nominal_m, print_m, T_world_from_face is not None)
+
+
+def _with_print(
+    request: Experiment,
+    attack: AttackFile,
+    found: Shown,
+    number: int,
+    texture: NDArray[np.uint8],
+    scale: float,
+    T_world_from_face: Array | None,
+) -> Shown:
     pose = attack.objects[number].T_world_from_object if T_world_from_face is None else T_world_from_face
     field = flat_object(request, request.objects[number], np.asarray(pose), len(texture))
-    objects, parts = list(found.objects), list(split_theta(found.objects, found.colours))
+    objects = list(found.objects)
+    parts = list(split_theta(objects, found.colours))
     objects[number] = replace(field, scale=field.scale * scale)
-    share = np.clip(texture.astype(np.float64) / 255.0, _MARGIN, 1.0 - _MARGIN)
-    parts[number] = torch.from_numpy(np.log(share / (1.0 - share))).to(found.colours.dtype)
+    parts[number] = _theta(texture).to(found.colours.dtype)
     colours = parts[0] if len(parts) == 1 else torch.cat([part.reshape(-1, 3) for part in parts])
-    shown = Shown(objects, colours)
-    totals_m, problem = [], prepared.problem.undisturbed()
-    for each in (prepared.space.plain, found, shown):
-        _, totals = evaluate(past_field(request, problem, prepared.space, each), each.colours)
-        totals_m.append(float(totals.protocol_cte_m.mean()))
-    return PrintEffect(totals_m[0], totals_m[1], totals_m[2], T_world_from_face is not None)
+    return Shown(objects, colours)
+
+
+def _theta(texture: NDArray[np.uint8]) -> Tensor:
+    share = np.clip(texture.astype(np.float64) / 255.0, _MARGIN, 1.0 - _MARGIN)
+    return torch.from_numpy(np.log(share / (1.0 - share)))
+
+
+def _total_m(prepared: Prepared, shown: Shown) -> float:
+    judged = past_field(prepared.experiment, prepared.problem.undisturbed(), prepared.space, shown)
+    _, totals = evaluate(judged, shown.colours)
+    return float(totals.protocol_cte_m.mean())

@@ -101,7 +101,7 @@ def run_attack(
     chosen_method(experiment)  # before anything is loaded or written
     require_utf8(folder.absolute())
     experiment = replace(experiment, folder=folder.resolve())
-    _keep_request(experiment)
+    keep_request(experiment)
     look_at_given(experiment)
     if experiment.config.attack.together:
         return _run_together(experiment, display, on_evaluation, on_prepared)
@@ -125,7 +125,7 @@ def attack_file(folder: Path, seed: int) -> Path:
     return folder / f"seed_{seed}.attack.safetensors"
 
 
-def _keep_request(experiment: Experiment) -> None:
+def keep_request(experiment: Experiment) -> None:
     """Write a request into its folder. Another one in it is refused once its search has begun; one that failed to load is replaced."""
     kept, text = experiment.folder / REQUEST, request_text(experiment)
     if not kept.exists() or not is_begun(experiment.folder):

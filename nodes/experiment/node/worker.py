@@ -56,12 +56,7 @@ class Speaker:
 
     def prepared(self, prepared: Prepared) -> None:
         """A seed is ready to be searched."""
-        # Of an interrupted search.
-        state, entries = self._state(prepared), "[]"
-        if state.exists():
-            entries = read_tensors(state, "torch", ())[0].get("history", "[]")
-        history = [evaluation_from_json(entry) for entry in json.loads(entries)]
-        done, self._best = len(history), max(history, key=lambda each: each.value, default=None)
+        done, self._best = _so_far(self._state(prepared))
         self._prepared, self._evaluations = prepared, planned_evaluations(prepared)
         self.say(
             "progress",
@@ -104,8 +99,9 @@ class Speaker:
         theta = self._best_theta(prepared)
         if theta is None:  # the method writes no state
             return
-        if (mount := prepared.space.mount) is not None:
-            self._image(TEXTURE, face_texture(prepared.space.attacked(theta)[mount.number].theta, 256))
+        texture = _texture(prepared, theta)
+        if texture is not None:
+            self._image(TEXTURE, texture)
         seen = prepared.problem.sensor.sense(prepared.problem.start_states[:1], theta).images
         pixels = tensor_to_images(seen)[0]
         self._image(PREVIEW, pixels.repeat(_PREVIEW_SCALE, 0).repeat(_PREVIEW_SCALE, 1))
@@ -130,6 +126,22 @@ class Speaker:
     def _image(self, name: str, pixels: NDArray[np.uint8]) -> None:
         height, width = pixels.shape[:2]
         self.say("image", np.ascontiguousarray(pixels).tobytes(), name=name, height=height, width=width)
+
+
+def _so_far(state: Path) -> tuple[int, Evaluation | None]:
+    """Number of evaluations of an interrupted search, and the best of them."""
+    if not state.exists():
+        return 0, None
+    entries = json.loads(read_tensors(state, "torch", ())[0].get("history", "[]"))
+    history = [evaluation_from_json(entry) for entry in entries]
+    return len(history), max(history, key=lambda each: each.value, default=None)
+
+
+def _texture(prepared: Prepared, theta: Tensor) -> NDArray[np.uint8] | None:
+    mount = prepared.space.mount
+    if mount is None:
+        return None
+    return face_texture(prepared.space.attacked(theta)[mount.number].theta, 256)
 
 
 def work(folder: Path, stream: BinaryIO) -> None:

@@ -164,34 +164,37 @@ def _live_parts(experiment: Experiment) -> dict[str, Any]:
         *driven.values(),
         *(each for cell in experiment.cells for each in _live_results(experiment, cell)),
     ]
-    found: dict[str, Any] = {}
-    if measured:
-        found["latency"] = rd.Latency(
-            np.concatenate([each["capture_to_serial_ms"] for each in measured]),
-            1e3 * experiment.config.dt_s,
-            sum(each["missed"] for each in measured),
-            {
-                f"capture to {name}": np.concatenate([each["hops_ms"][name] for each in measured])
-                for name in evaluation.HOPS
-            },
-        )
-    wanted, missing = experiment.config.deploy.laps, {} if measured else {"latency": "no live drive counts"}
+    found: dict[str, Any] = {
+        "latency": _latency(experiment, measured),
+        "not_measured": _not_measured(experiment, driven, measured),
+    }
     if "laps" in driven:
         laps = driven["laps"]
         found["laps"] = rd.Laps(
-            wanted,
+            experiment.config.deploy.laps,
             np.array(laps["states"]),
             np.array(laps["cte_m"]),
             laps["metrics"]["mean_cte_m"],
             laps["metrics"]["off_track"],
         )
-    elif wanted:
-        missing["laps"] = (
+    return found
+
+
+def _not_measured(
+    experiment: Experiment, driven: dict[str, dict[str, Any]], measured: list[dict[str, Any]]
+) -> dict[str, str]:
+    """Reasons for missing parts of the report."""
+    found = {}
+    if "laps" not in driven:
+        wanted = experiment.config.deploy.laps
+        found["laps"] = (
             f"all tries were spoiled; remove {experiment.stage_folder('live')} to drive the laps again"
+            if wanted
+            else "this setting drives no laps; make experiment does"
         )
-    else:
-        missing["laps"] = "this setting drives no laps; make experiment does"
-    return {**found, "not_measured": missing}
+    if not measured:
+        found["latency"] = "no live drive counts"
+    return found
 
 
 def _settings(experiment: Experiment) -> dict[str, str]:
@@ -292,6 +295,28 @@ def _fidelity(experiment: Experiment) -> rd.Fidelity:
     return rd.Fidelity(tuple(views), experiment.car.control_unit)
 
 
+def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latency | None:
+    if not results:
+        return None
+    samples = np.concatenate([r["capture_to_serial_ms"] for r in results])
+    hops_ms = {
+        f"capture to {name}": np.concatenate([r["hops_ms"][name] for r in results])
+        for name in evaluation.HOPS
+    }
+    period_ms = 1e3 * experiment.config.dt_s
+    return rd.Latency(samples, period_ms, sum(r["missed"] for r in results), hops_ms)
+
+
+def _timings(experiment: Experiment) -> dict[str, float]:
+    config = experiment.config
+    policies = dict.fromkeys(map(config.policy_stage, config.attacked))
+    names = ("capture", "scene", "bake", *policies, "object", "retrain", "live")
+    records = {name: read_artefact(experiment.stage_folder(name)) for name in names}
+    results = [experiment.cell_result(cell) for cell in experiment.cells]
+    seconds = {name: record.seconds for name, record in records.items() if record is not None}
+    return {**seconds, "cells": sum(read_json(file)["seconds"] for file in results)}
+
+
 def _manifest(experiment: Experiment) -> rd.Manifest:
     manifest = read_json(experiment.folder / "manifest.json")
     machine = {
@@ -300,17 +325,11 @@ def _manifest(experiment: Experiment) -> rd.Manifest:
         "memory": f"{memory_gib():.0f} GiB",
         "system": platform.platform(),
     }
-    config = experiment.config
-    policies = dict.fromkeys(map(config.policy_stage, config.attacked))
-    names = ("capture", "scene", "bake", *policies, "object", "retrain", "live")
-    records = {name: read_artefact(experiment.stage_folder(name)) for name in names}
-    seconds = {name: record.seconds for name, record in records.items() if record is not None}
-    seconds["cells"] = sum(read_json(experiment.cell_result(cell))["seconds"] for cell in experiment.cells)
     return rd.Manifest(
         manifest["command"],
         frozen_hashes(experiment),
         manifest["versions"],
         machine,
         _settings(experiment),
-        seconds,
+        _timings(experiment),
     )

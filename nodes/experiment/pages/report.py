@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from pathlib import Path
-from statistics import fmean
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,7 +14,7 @@ from rich.console import Console
 
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.documents import read_json
-from advnerf_core.geometry import Array, invert_transform, planar_poses, transform_points
+from advnerf_core.geometry import planar_poses
 from advnerf_core.policies.network import tensor_to_images
 from advnerf_core.report.cells import read_cell
 from advnerf_core.report.conditions import NONE, style_of
@@ -26,22 +24,21 @@ from advnerf_core.report.result_page import maximised_table, not_driven, text_ta
 from advnerf_core.report.result_table import ResultTable, make_table
 from advnerf_core.report.targets import Target, evaluate, target_table
 from advnerf_core.report.text_table import count
-from hardware.worlds.world import Overview, Rgb, World
-from nodes.experiment.engine.artefact import read_artefact
-from nodes.experiment.engine.run_folder import CELLS, SEARCHED
+from hardware.worlds.world import World
+from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.pages.gather import gather
-from nodes.experiment.pages.table import Wording, first_screen, wanted_rows, write_table
+from nodes.experiment.pages.opening import Wording, first_screen
+from nodes.experiment.pages.table import wanted_rows, write_table
 from nodes.experiment.plan.carriers import FaceCarrier
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import know_methods_of
 from nodes.experiment.plan.object_kinds import name_of
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.learned_scene import FIDELITY
+from nodes.experiment.show.overview import from_above
 from nodes.experiment.show.spaces import make_space
 from nodes.experiment.steps import films
 from nodes.experiment.steps.attack import dress_cell, load_shown, planned_evaluations
 from nodes.experiment.steps.keys import driven_folder
-from nodes.experiment.steps.pipeline import stages_of
 from nodes.runtime.console import plain_console
 from nodes.runtime.progress import Report
 
@@ -51,11 +48,6 @@ _TABLE_WIDTH = 160
 _SEEN_AT_M = (9.0, 14.0)
 # In the learned scene, of this many points of a drive those are shown where most of the objects is visible.
 _LOOKED_AT, _SHOWN = 12, 2
-
-# Of the world from above: colours of paths and objects, and the points that a path is drawn by.
-_PATHS_RGB = ((40, 110, 230), (235, 140, 20), (200, 40, 170), (20, 150, 110), (120, 80, 200), (150, 110, 40))
-_OBJECT_RGB = (240, 30, 30)
-_ABOVE_GROUND_M, _SPACING_M = 0.05, 0.25
 
 
 def run(experiment: Experiment, folder: Path, report: Report, notes: Sequence[str] = ()) -> None:
@@ -109,17 +101,20 @@ def how_it_was_run(experiment: Experiment) -> str:
     methods = ", ".join(style_of(name).title for name in config.method_names)
     kinds = Counter(thing.kind.replace("_", " ") for thing in experiment.objects)
     named = " and ".join(count(number, kind) for kind, number in kinds.items())
-    then = f", then put into the world {experiment.deployed_world.kind}"
-    if config.deploy.live:
-        then = ", then shown to the driving car, frame by frame, by the live node graph"
-    elif config.deploy.through == "nothing":
-        then = "; nothing was driven in the place itself"
     searched = (config.carrier if isinstance(config.carrier, FaceCarrier) else config.space).searched
     return (
         f"Policies ({', '.join(config.attacked)}) drive {', '.join(config.cell_paths)}. {searched.format(named)} ({methods}; {planned_evaluations(experiment)} evaluations "
         f"each, {count(len(config.seeds), 'seed')}, {count(attack.starts, 'start')}, {experiment.searched_ticks} ticks of {config.dt_s:g} s)"
-        f"{then}. Drives last {config.horizon} ticks, from {count(config.measure.starts, 'start')} that no search used."
+        f"{_then(experiment)}. Drives last {config.horizon} ticks, from {count(config.measure.starts, 'start')} that no search used."
     )
+
+
+def _then(experiment: Experiment) -> str:
+    if experiment.config.deploy.live:
+        return ", then shown to the driving car, frame by frame, by the live node graph"
+    if experiment.config.deploy.through == "nothing":
+        return "; nothing was driven in the place itself"
+    return f", then put into the world {experiment.deployed_world.kind}"
 
 
 def print_summary(experiment: Experiment, console: Console) -> None:
@@ -136,35 +131,6 @@ def print_summary(experiment: Experiment, console: Console) -> None:
     if text := not_driven(table):
         console.print(text, highlight=False, markup=False, soft_wrap=True)
     console.print(f"report: {folder / PAGE}", highlight=False, soft_wrap=True)
-
-
-def setting_lines(experiment: Experiment) -> list[str]:
-    """What an experiment in a small setting was, and what it took: setting, held-out views, the victims' own errors, and seconds of each part.
-
-    Of what is finished; stages that are taken from elsewhere count with the seconds that they took there.
-    """
-    config, cells = experiment.config, list(table_of(experiment).cells.values())
-    lines = [
-        f"setting {experiment.setting}: {config.horizon} ticks driven, {config.attack.horizon} searched over, "
-        f"{config.attack.evaluations} evaluations from {config.attack.starts} starts, "
-        f"seeds {', '.join(map(str, config.seeds))}, methods {', '.join([NONE, *config.method_names])}"
-    ]
-    with suppress(OSError, ValueError, KeyError):
-        mean = read_json(experiment.stage_folder("scene") / FIDELITY)["mean"]
-        lines.append(
-            f"held-out views: {mean['psnr_full_db']:.1f} dB at full size, {mean['psnr_policy_db']:.1f} dB as the policy sees them"
-        )
-    own = {cell.victim: cell.deployed for cell in cells if cell.method == NONE}
-    if said := [
-        f"{victim} {'not driven live' if found is None else f'{fmean(found.total_cte_m):.2f} m'}"
-        for victim, found in own.items()
-    ]:
-        lines.append(f"total CTE of the victims without attack, live: {', '.join(said)}")
-    names = [*(stage.name for stage in stages_of(experiment)), "report"]
-    found = {name: read_artefact(experiment.stage_folder(name)) for name in names}
-    spent = {name: each.seconds for name, each in found.items() if each is not None}
-    spent["cells"] = sum(cell.seconds for cell in cells)
-    return [*lines, "seconds: " + ", ".join(f"{name} {seconds:.0f}" for name, seconds in spent.items())]
 
 
 def table_of(experiment: Experiment) -> ResultTable:
@@ -194,7 +160,7 @@ def textures_seen(
 def seen_where_learned(experiment: Experiment, space: Space, scenario: str) -> dict[str, NDArray[np.uint8]]:
     """Policy images in the learned scene past the plain, random and attacked objects of the first seed, where most of them is in view."""
     victim, seed = experiment.config.main_victim, experiment.config.seeds[0]
-    driven = films.states_in(driven_folder(experiment, Cell(scenario, victim, NONE, 0)) / SEARCHED)[0]
+    driven = films.drives_of(experiment, "surrogate", Cell(scenario, victim, NONE, 0))[0]
     states = driven[np.linspace(0, len(driven) - 1, min(_LOOKED_AT, len(driven))).astype(int)]
     poses = planar_poses(states) @ experiment.mount
 
@@ -209,29 +175,3 @@ def seen_where_learned(experiment: Experiment, space: Space, scenario: str) -> d
         pictures = rendered(load_shown(space, driven_folder(experiment, cell), cell))[best]
         seen[method] = np.concatenate(tensor_to_images(pictures), axis=1)
     return seen
-
-
-def from_above(experiment: Experiment, world: World) -> Rgb | None:
-    """An open world's own view from above ``[H, W, 3]``; None if it has none: the page then draws a map of the drives."""
-    if not isinstance(world, Overview):
-        return None
-    photograph, pinhole, T = world.overview()
-    picture = photograph.copy()
-
-    def project(points: Array) -> Array:
-        return pinhole.project(transform_points(invert_transform(T), points))
-
-    driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.car.speed_mps
-    for index, reference in enumerate(experiment.references.values()):
-        along = np.arange(0.0, driven_m, _SPACING_M)
-        points = np.array([[*reference.pose_at(float(s))[:2], _ABOVE_GROUND_M] for s in along])
-        _draw(picture, project(points), _PATHS_RGB[index % len(_PATHS_RGB)], False)
-    for thing in experiment.objects:
-        corners = np.array([[x, y, thing.z_m] for x, y in thing.corners_m()])
-        _draw(picture, project(corners), _OBJECT_RGB, True)
-    return picture
-
-
-def _draw(picture: Rgb, pixels: Array, rgb: tuple[int, int, int], closed: bool) -> None:
-    line = np.rint(pixels * 16.0).astype(np.int32)[:, None]
-    cv2.polylines(picture, [line], closed, rgb, thickness=2, lineType=cv2.LINE_AA, shift=4)

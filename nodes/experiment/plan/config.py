@@ -15,13 +15,13 @@ from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.strict import StrictModel
 from nodes.experiment.plan import rules
 from nodes.experiment.plan.carriers import CarrierConfig, ComposedConfig, FaceCarrier
+from nodes.experiment.plan.deploy_config import DeployConfig
 from nodes.experiment.plan.numbers import Length, Positive, PositiveNumber
 from nodes.experiment.plan.over import OverConfig
 from nodes.experiment.plan.placed import WantedObject
 from nodes.experiment.plan.sections import (
     AttackConfig,
     CaptureConfig,
-    DeployConfig,
     MeasureConfig,
     ObjectConfig,
     PolicyConfig,

@@ -184,9 +184,7 @@ def _lay_over(
     for name, value in values.items():
         here, there = (*key, name), (*origin, *key, name)
         before = target.get(name)
-        both = isinstance(value, dict) and isinstance(before, dict)
-        # A section of another kind has other keys: it replaces the earlier one.
-        if both and not ("kind" in value and value["kind"] != before.get("kind")):
+        if isinstance(value, dict) and isinstance(before, dict) and not _another_kind(before, value):
             _lay_over(document, value, origin, here, places)
             continue
         target[name] = value
@@ -197,3 +195,8 @@ def _lay_over(
         document.places |= {
             (*here, *at[len(there) :]): place for at, place in source.items() if at[: len(there)] == there
         }
+
+
+def _another_kind(before: Mapping[str, Any], value: Mapping[str, Any]) -> bool:
+    """Whether a section has another ``kind``, with other keys: it then replaces the earlier one."""
+    return "kind" in value and value["kind"] != before.get("kind")

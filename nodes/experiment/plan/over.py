@@ -120,11 +120,7 @@ def variants_in(over: Any) -> dict[str, list[AxisChange]]:
         return {}
     named, factors = (
         over.get(VARIANT),
-        [
-            _values(key, each)
-            for key, each in over.items()
-            if isinstance(each, list) and key not in (VARIANT, *COORDINATES)
-        ],
+        [_values(key, each) for key, each in over.items() if _is_axis(key, each)],
     )
     if isinstance(named, dict) and named:
         factors.insert(0, [(name, _changes(name, changes)) for name, changes in named.items()])
@@ -150,6 +146,10 @@ def _changes(name: str, changes: Any) -> list[AxisChange]:
     """The changes of a named variant."""
     items = changes.items() if isinstance(changes, dict) else ()
     return [AxisChange(str(key), value, (OVER, VARIANT, name, key)) for key, value in items]
+
+
+def _is_axis(key: str, values: Any) -> bool:
+    return isinstance(values, list) and key != VARIANT and key not in COORDINATES
 
 
 def _values(key: str, values: list[Any]) -> list[tuple[str, list[AxisChange]]]:

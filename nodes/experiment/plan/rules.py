@@ -8,15 +8,10 @@ from itertools import combinations
 from advnerf_core.attack.methods import METHODS, load_method, require_options
 from advnerf_core.plugins import name_in_results
 from nodes.experiment.plan.carriers import CarrierConfig, FaceCarrier
+from nodes.experiment.plan.deploy_config import DeployConfig
 from nodes.experiment.plan.object_kinds import OBJECT_SUFFIX, PANEL, name_of
 from nodes.experiment.plan.placed import FLAT, PlacedObject, WantedObject
-from nodes.experiment.plan.sections import (
-    AttackConfig,
-    DeployConfig,
-    MeasureConfig,
-    PolicyConfig,
-    RetrainConfig,
-)
+from nodes.experiment.plan.sections import AttackConfig, MeasureConfig, PolicyConfig, RetrainConfig
 from nodes.experiment.plan.space_config import (
     ColoursConfig,
     MeshShapeConfig,

@@ -13,9 +13,8 @@ from advnerf_core.attack.spaces.space import Space
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.load import is_code, policy_files
 from advnerf_core.report.conditions import NONE
-from advnerf_core.report.evidence.kept_build import VICTIM
 from hardware.worlds.world import World
-from nodes.experiment.engine.artefact import REFERENCE, Artefact, ReferenceBuild, write_artefact
+from nodes.experiment.engine.artefact import REFERENCE, VICTIM, Artefact, ReferenceBuild, write_artefact
 from nodes.experiment.engine.stages import Stage, keep_stages, outdated
 from nodes.experiment.plan.cell import SEARCHED_SHARE, Cell
 from nodes.experiment.plan.space_config import PlacesConfig
@@ -39,24 +38,30 @@ from nodes.experiment.steps.pipeline import stages_of, stages_of_cells
 from nodes.runtime.progress import Report
 
 
-class Bench(ExitStack):
+class Bench:
     """Common resources of an experiment's cells while several are run one after the other: the open world, the space, the live nodes.
 
     Its scene, objects and policies are finished (``advnerf experiment run FILE --until policy``).
     """
 
     def __init__(self, experiment: Experiment) -> None:
-        super().__init__()
         self.experiment = experiment
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._stack.close()
 
     @cached_property
     def scene(self) -> World | None:
         """The open world; None if neither a search nor a drive uses it."""
         experiment = self.experiment
         if over_the_world(experiment):
-            return self.enter_context(experiment.open_world())
+            return self._stack.enter_context(experiment.open_world())
         if experiment.config.deploy.through == "world":
-            return self.enter_context(experiment.open_deployed_world())
+            return self._stack.enter_context(experiment.open_deployed_world())
         return None
 
     @cached_property
@@ -68,7 +73,7 @@ class Bench(ExitStack):
     def deployed_in(self) -> World | LiveNodes | None:
         """The open world, or the live nodes; None if nothing is deployed."""
         if self.experiment.config.deploy.live:
-            return self.enter_context(LiveNodes(self.experiment))
+            return self._stack.enter_context(LiveNodes(self.experiment))
         return None if self.experiment.config.deploy.through == "nothing" else self.scene
 
 

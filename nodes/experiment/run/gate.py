@@ -73,11 +73,7 @@ def cached_verdict(
     policy, goal = fidelity.policy_of(experiment, cell)
     which = [cell.scenario, cell.victim, *(["drive", cell.seed] if drive else [])]
     stages = digests_in(experiment.folder, stages_needed(experiment.config, cell.victim))
-    # A retrained network belongs to no stage that all cells need.
-    weights = hashlib.sha256()
-    for name, weight in sorted(getattr(policy, "state_dict", dict)().items()):
-        weights.update(name.encode() + weight.detach().cpu().numpy().tobytes())
-    key = hash_of([stages, weights.hexdigest(), limits.model_dump(mode="json"), *which])
+    key = hash_of([stages, _weights_sha256(policy), limits.model_dump(mode="json"), *which])
     for known in (file, *published):
         if (kept := read_current(known, key=key)) is not None:
             if known != file:
@@ -91,6 +87,14 @@ def cached_verdict(
     verdict = judge(agreement_on(policy, goal, pictures), limits, pictures.of)
     write_json(file, {"key": key, **verdict.record()})
     return verdict
+
+
+def _weights_sha256(policy: Any) -> str:
+    """Hash of a network's weights; a retrained one belongs to no stage that all cells need."""
+    digest = hashlib.sha256()
+    for name, weight in sorted(getattr(policy, "state_dict", dict)().items()):
+        digest.update(name.encode() + weight.detach().cpu().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def lacks(experiment: Experiment, cell: Cell, folder: Path) -> str:

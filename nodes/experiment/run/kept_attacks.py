@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from advnerf_core.attack.artifact import AttackFileError, load_attack, save_attack
+from advnerf_core.attack.artifact import AttackFile, AttackFileError, load_attack, save_attack
 from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.verify import Verified
@@ -44,8 +44,7 @@ def publish_attacks(experiment: Experiment, found: Sequence[CellStatus], folder:
         if source is None or target.exists():
             continue
         attack = load_attack(source)
-        in_half_precision = sum(2 * each.theta.size for each in attack.objects)
-        if in_half_precision <= SMALL_BYTES or _is_of(each.result, claimed):
+        if _bytes(attack) <= SMALL_BYTES or _is_of(each.result, claimed):
             save_attack(target, attack, small=True)
             written.append(target)
     return written
@@ -87,6 +86,11 @@ def _claimed(folder: Path) -> set[str]:
 def _is_of(cell: CellResult, methods: set[str]) -> bool:
     """Whether a cell is of one of these methods; of none is every cell."""
     return not methods or cell.method in methods
+
+
+def _bytes(attack: AttackFile) -> int:
+    """Size of its textures in half precision."""
+    return sum(2 * each.theta.size for each in attack.objects)
 
 
 def _problems_of(cell: CellResult, file: Path) -> Iterator[str]:

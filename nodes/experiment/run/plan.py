@@ -1,4 +1,4 @@
-"""Plans the cells to run, each with its current settings, and the possible places of its result; and finds finished ones to map."""
+"""Plans the cells to run: each with its current settings, and the possible places of its result."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import VictimChangedError
 from nodes.experiment.steps.keys import cell_settings, registered_settings, settings_hash
 from nodes.runtime.errors import ConfigError, RuntimeFault
-from nodes.runtime.progress import ProgressDisplay
 
 # In a message.
 _MOST_DIFFERENCES = 5
@@ -157,30 +156,3 @@ def current_key(experiment: Experiment, cell: Cell) -> tuple[str | None, str]:
         return None, "its victim changed since it was last looked at; advnerf experiment run looks again"
     except (RuntimeFault, OSError):
         return None, ""
-
-
-def map_cells(experiment: Experiment, cells: Sequence[Cell], number: int | None = None) -> list[Path]:
-    """Draw the maps of all finished cells; existing ones are read from their files. Without a number the experiment says which object is moved.
-
-    Raises:
-        ConfigError: No cell is finished, or none has placed objects.
-    """
-    from nodes.experiment.steps.pose_maps import draw_maps, is_mapped  # loads torch
-
-    store, pictures = Store(experiment.folder), []
-    for cell in cells:
-        inside = experiment.of(cell)
-        status = store.status(cell, current_key(experiment, cell)[0])
-        wanted = inside.config.maps.object if number is None else number
-        if status.state != "done" or status.result is None or not is_mapped(inside, cell.inside, wanted):
-            continue
-        with ProgressDisplay() as display:
-            pictures += draw_maps(
-                inside, cell.inside, wanted, store.work(cell.name), display.start(cell.name)
-            )
-    if not pictures:
-        raise ConfigError(
-            f"expected finished cells that have placed objects (space.kind=places), got none of {len(cells)}; run them first, "
-            "see advnerf experiment status"
-        )
-    return pictures

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from advnerf_core.documents import read_json
 from advnerf_core.files import write_atomically, write_json
-from advnerf_core.report.cells import read_cell, read_cells
+from advnerf_core.report.cells import CellResult, read_cell, read_cells
 from advnerf_core.report.evidence.hardness import FILE as HARDNESS
-from advnerf_core.report.evidence.hardness import PUBLISHED_FILE, merged, read_hardness
+from advnerf_core.report.evidence.hardness import PUBLISHED_FILE, merged, read_hardness, write_hardness
 from advnerf_core.report.result_table import ResultTable, make_table
 from nodes.experiment.engine.artefact import (
     BUILD,
@@ -56,36 +56,38 @@ def publish(
     Cells there that are not finished here stay: they may have been run on another machine. With ``prune`` those whose results here have other
     settings too are removed.
     """
-    written, same, stale, own = [], [], [], folder / experiment.config.name
+    written, same, stale = [], [], []
     for each in found:
-        target = own / f"{each.cell.name}.json"
-        # One with newer settings, from another machine, stays.
-        here = each.result if each.state == "changed" and target.exists() else None
-        if here is not None and read_cell(target).settings_hash == here.settings_hash:
+        target = folder / experiment.config.name / f"{each.cell.name}.json"
+        if each.state == "changed" and _is_of(target, each.result):
             stale.append(each.cell.name)
             if prune:
                 target.unlink()
-                prediction_file(own, each.cell.name).unlink(missing_ok=True)
+                prediction_file(folder / experiment.config.name, each.cell.name).unlink(missing_ok=True)
         if each.state != "done":
             continue
-        assert each.file is not None, "a done cell is somewhere"
-        text = each.file.read_text(encoding="utf-8")
-        # Under its name here: the variant's own run folder uses the name of its path.
-        if (data := json.loads(text))["scenario"] != each.cell.scenario:
-            text = json.dumps({**data, "scenario": each.cell.scenario}, indent=1) + "\n"
+        text = _as_published(each)
         if target.exists() and target.read_text(encoding="utf-8") == text:
             same.append(each.cell.name)
             continue
         write_atomically(target, text)
         written.append(each.cell.name)
-    _publish_beside(experiment, [each for each in found if each.state == "done"], own)
-    publish_attacks(experiment, found, own)
-    # Every verdict of the victims, also of recipes that did not pass.
-    runs = dict.fromkeys(experiment.folder_of(cell) for cell in experiment.cells)
-    record = merged([read_hardness(own / PUBLISHED_FILE), *(read_hardness(run / HARDNESS) for run in runs)])
-    if record.verdicts:
-        write_json(own / PUBLISHED_FILE, record.model_dump(mode="json"))
+    _publish_beside(
+        experiment, [each for each in found if each.state == "done"], folder / experiment.config.name
+    )
+    publish_attacks(experiment, found, folder / experiment.config.name)
+    _publish_hardness(experiment, folder / experiment.config.name)
     return Published(tuple(written), tuple(same), tuple(stale))
+
+
+def _as_published(found: CellStatus) -> str:
+    """Content of a finished cell's file, under its name here: the variant's own run folder uses the name of its path."""
+    assert found.file is not None, "a done cell is somewhere"
+    cell, text = found.cell, found.file.read_text(encoding="utf-8")
+    data = json.loads(text)
+    if data["scenario"] == cell.scenario:
+        return text
+    return json.dumps({**data, "scenario": cell.scenario}, indent=1) + "\n"
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,15 @@ def _prune_build(reference: ReferenceBuild, published: Path) -> list[Path]:
     return removed
 
 
+def _is_of(published: Path, result: CellResult | None) -> bool:
+    """Whether a published cell equals that result, and is not one with newer settings from another machine."""
+    return (
+        result is not None
+        and published.exists()
+        and read_cell(published).settings_hash == result.settings_hash
+    )
+
+
 def _publish_beside(experiment: Experiment, done: Sequence[CellStatus], folder: Path) -> None:
     for each in done:
         assert each.result is not None, "a finished cell has a result"
@@ -148,6 +159,16 @@ def _publish_beside(experiment: Experiment, done: Sequence[CellStatus], folder: 
             # Another machine judges the same scene and policy again, with other last digits: what was published stays.
             if (judged := read_current(verdict)) is not None and not has_key(published, judged["key"]):
                 write_json(published, judged)
+
+
+def _publish_hardness(experiment: Experiment, folder: Path) -> None:
+    """Publish every verdict of the victims, also of recipes that did not pass."""
+    runs = dict.fromkeys(experiment.folder_of(cell) for cell in experiment.cells)
+    record = merged(
+        [read_hardness(folder / PUBLISHED_FILE), *(read_hardness(run / HARDNESS) for run in runs)]
+    )
+    if record.verdicts:
+        write_hardness(folder / PUBLISHED_FILE, record)
 
 
 def published_table(folder: Path, experiment: Experiment, cells: Sequence[Cell] | None = None) -> ResultTable:

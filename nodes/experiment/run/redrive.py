@@ -16,13 +16,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from advnerf_core.report.cells import read_cell
+from advnerf_core.report.cells import CellResult, read_cell
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.kept import KeptDrive, kept_drives
-from advnerf_core.report.evidence.kept_build import LOST, VICTIM, is_kept
+from advnerf_core.report.evidence.kept_build import LOST, is_kept
 from advnerf_core.report.evidence.registration import read_registration
 from advnerf_core.report.evidence.verifying.git import last_commit
-from nodes.experiment.engine.artefact import BUILD, Artefact, ReferenceBuild
+from nodes.experiment.engine.artefact import BUILD, VICTIM, Artefact, ReferenceBuild
 from nodes.experiment.engine.run_folder import ATTACK
 from nodes.experiment.engine.stages import key_of
 from nodes.experiment.plan.cell import Cell
@@ -75,27 +75,14 @@ def redrive(
     names = {file.stem for file in published.glob("*.json")}
     known = [cell for cell in experiment.cells if cell.name in names]
     chosen = random.Random(seed).sample(known, min(count, len(known)))
-    registration = read_registration(published)
-    found, registered = [], {} if registration is None else registration.scenarios
+    found = []
     for cell in chosen:
         tell(f"{cell.name}: driven again")
         said = read_cell(published / f"{cell.name}.json")
         variant = experiment.of(cell)
         look_at_given(variant)
-        # Its stages, as if this version had made them.
-        build, records = ReferenceBuild(published.parent / BUILD), dict[str, Artefact]()
-        for stage in stages_of(variant):
-            if stage.name in said.stages:
-                key, folder = key_of(stage, records), variant.stage_folder(stage.name)
-                taken = build.take_digest(stage.name, said.stages[stage.name], key, folder)
-                if taken is None:
-                    raise RedriveError(f"{said.name} {LOST}")
-                records[stage.name] = taken
-        then, now = registered.get(cell.scenario), registered_scenario(variant, cell.path)
-        if differ := [
-            name for name in _DRIVEN if then is not None and getattr(then, name) != getattr(now, name)
-        ]:
-            raise unreadable(published, f"expected the {', '.join(differ)} that were registered, got others")
+        _take_stages(variant, said, ReferenceBuild(published.parent / BUILD))
+        _require_same_drives(variant, cell, published)
         again = _again(variant, cell.inside, attack_file(published, said.attack_id or NONE))
         found.append(_compared(cell.name, said.kept["surrogate"], again))
     return found
@@ -123,6 +110,27 @@ def unreadable(published: Path, why: str) -> RedriveError:
     commit = last_commit(published)
     of = f", git checkout {commit[:12]}" if commit else ""
     return RedriveError(f"{published.name}: {why}; drive it again with the version that published it{of}")
+
+
+def _require_same_drives(variant: Experiment, cell: Cell, published: Path) -> None:
+    """Raise if this version would drive differently from the registered drives."""
+    registration = read_registration(published)
+    then = None if registration is None else registration.scenarios.get(cell.scenario)
+    now = registered_scenario(variant, cell.path)
+    if differ := [name for name in _DRIVEN if then is not None and getattr(then, name) != getattr(now, name)]:
+        raise unreadable(published, f"expected the {', '.join(differ)} that were registered, got others")
+
+
+def _take_stages(experiment: Experiment, said: CellResult, build: ReferenceBuild) -> None:
+    """Put the stages of a published cell into the run folder, as if this version had made them."""
+    records: dict[str, Artefact] = {}
+    for stage in stages_of(experiment):
+        if stage.name in said.stages:
+            key, folder = key_of(stage, records), experiment.stage_folder(stage.name)
+            found = build.take_digest(stage.name, said.stages[stage.name], key, folder)
+            if found is None:
+                raise RedriveError(f"{said.name} {LOST}")
+            records[stage.name] = found
 
 
 def _again(experiment: Experiment, cell: Cell, attack: Path) -> list[KeptDrive]:

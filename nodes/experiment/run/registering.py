@@ -49,16 +49,6 @@ def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> 
     Raises:
         SetError: Another registration has this name, cells with these settings were run already, or a test lacks baselines.
     """
-    scenarios: dict[str, RegisteredScenario] = {}
-    for cell in cells:
-        if cell.scenario not in scenarios:
-            variant = experiment.of(cell)
-            look_at_given(variant)  # their hashes are fixed before anything is run
-            variant.ask_world()
-            scenarios[cell.scenario] = registered_scenario(variant, cell.path)
-    require_searchable(experiment, cells)
-    for variant in {cell.variant: experiment.of(cell) for cell in cells}.values():
-        check_options(variant.config.methods, variant.config.attack)
     found = Registration(
         name=experiment.config.name,
         file=experiment.file.name,
@@ -66,7 +56,7 @@ def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> 
         overrides=experiment.overrides,
         date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         software_version=version("advnerf"),
-        scenarios=scenarios,
+        scenarios=_scenarios(experiment, cells),
         cells=tuple(registered_cell(cell) for cell in cells),
         primary=tuple(primary_tests(experiment, cells)),
         contrasts=experiment.config.contrasts,
@@ -83,6 +73,20 @@ def register(experiment: Experiment, cells: Sequence[Cell], published: Path) -> 
         )
     _refuse_late(experiment, cells)
     write_json(folder / FILE, found.model_dump(mode="json"))
+    return found
+
+
+def _scenarios(experiment: Experiment, cells: Sequence[Cell]) -> dict[str, RegisteredScenario]:
+    found: dict[str, RegisteredScenario] = {}
+    for cell in cells:
+        if cell.scenario not in found:
+            variant = experiment.of(cell)
+            look_at_given(variant)  # their hashes are fixed before anything is run
+            variant.ask_world()
+            found[cell.scenario] = registered_scenario(variant, cell.path)
+    require_searchable(experiment, cells)
+    for variant in {cell.variant: experiment.of(cell) for cell in cells}.values():
+        check_options(variant.config.methods, variant.config.attack)
     return found
 
 

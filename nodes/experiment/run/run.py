@@ -234,10 +234,7 @@ def _is_wanted(store: Store, each: Job, elsewhere: Sequence[Path], options: Opti
     status = store.status(each.cell, each.settings_hash, elsewhere)
     if status.state == NOT_DRIVEN:
         if options.retry:
-            # Also of the drives without attack for comparison.
-            work = store.work(each.cell.name)
-            for folder in (work, *(work.parent / "shared").glob("*")):
-                allow_more_tries(folder)
+            _allow_more_tries(store, each.cell.name)
         else:
             say(f"{each.cell.name}: not driven live, not tried again without --retry: {status.text}")
         return options.retry
@@ -248,6 +245,13 @@ def _is_wanted(store: Store, each: Job, elsewhere: Sequence[Path], options: Opti
         say(f"{each.cell.name}: another process runs it")
         return False
     return status.state != "done"
+
+
+def _allow_more_tries(store: Store, name: str) -> None:
+    """Allow three more tries of a cell's drives, and of the drives without attack for comparison."""
+    work = store.work(name)
+    for folder in (work, *(work.parent / "shared").glob("*")):
+        allow_more_tries(folder)
 
 
 def _run_beside(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:
@@ -271,13 +275,8 @@ def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> 
         for _ in range(_ROUNDS):
             lost = []
             for job, end in run_on_ray(run_in_process, left, min(at_a_time, cores)):
-                if end is None and (result := Store(Path(job.folder)).result(job.name)) is not None:
-                    # Its message was lost alone; a search has no result, and resumes from its state.
-                    end = (
-                        Ended(job.name, "done", "", 0.0)
-                        if result.settings_hash == job.settings_hash
-                        else None
-                    )
+                if end is None and _is_finished(job):
+                    end = Ended(job.name, "done", "", 0.0)
                 if end is None:
                     lost.append(job)
                 else:
@@ -288,6 +287,12 @@ def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> 
             left = lost
         text = "its machine was lost again and again; it goes on when the experiment is run again"
         return ended + [_tell(Ended(job.name, "lost", text, 0.0), say) for job in left]
+
+
+def _is_finished(job: Job) -> bool:
+    """Whether a result with these settings exists, even without its message; a search has no result and resumes from its state."""
+    result = Store(Path(job.folder)).result(job.name)
+    return result is not None and result.settings_hash == job.settings_hash
 
 
 def _tell(end: Ended, say: Say) -> Ended:

@@ -117,9 +117,7 @@ class Store:
             return CellStatus(cell, "done", "", ours, self.result_file(name))
         if settings_hash is not None and (found := _first_of(elsewhere, settings_hash)) is not None:
             file, other = found
-            # Under its name here: the variant's own run folder uses the name of its path.
-            named = other.model_copy(update={"scenario": cell.scenario})
-            return CellStatus(cell, "done", f"from {file}", named, file)
+            return CellStatus(cell, "done", f"from {file}", _named(other, cell), file)
         if ours is not None:
             return CellStatus(cell, NOT_DRIVEN, ours.not_driven_live, ours, self.result_file(name))
         if settings_hash is not None and (error := self.error(name, settings_hash)):
@@ -158,3 +156,8 @@ def _first_of(files: Sequence[Path], settings_hash: str) -> tuple[Path, CellResu
         if result.settings_hash == settings_hash and not result.not_driven_live:
             return file, result
     return None
+
+
+def _named(result: CellResult, cell: Cell) -> CellResult:
+    """A result under its name here: the variant's own run folder uses the name of its path."""
+    return result.model_copy(update={"scenario": cell.scenario})

@@ -77,12 +77,7 @@ def run_experiment(
         say = partial(_say, console, record)
         require_same_steering(experiment, not options.gate, say)
         if record is not None:
-            # Cells that will not be run again: finished, or failed before.
-            for each in statuses(experiment, chosen):
-                if each.state in FINISHED and not (each.state == NOT_DRIVEN and options.retry):
-                    record.finish(each.cell.name, 0.0, cached=True)
-                elif each.state == "failed" and not options.retry:
-                    record.fail(each.cell.name, each.text)
+            _record_cells_there(experiment, chosen, options, record)
         ended = run_cells(experiment, chosen, options, say, console, record)
         _write_report(experiment, console, record)
     console.print(
@@ -115,6 +110,17 @@ def _say(console: Console, record: ProgressRecord | None, text: str) -> None:
         record.say(text)
 
 
+def _record_cells_there(
+    experiment: Experiment, chosen: Sequence[Cell], options: Options, record: ProgressRecord
+) -> None:
+    """Record the cells that will not be run again: finished, or failed before."""
+    for each in statuses(experiment, chosen):
+        if each.state in FINISHED and not (each.state == NOT_DRIVEN and options.retry):
+            record.finish(each.cell.name, 0.0, cached=True)
+        elif each.state == "failed" and not options.retry:
+            record.fail(each.cell.name, each.text)
+
+
 def _write_report(experiment: Experiment, console: Console, record: ProgressRecord | None) -> None:
     """The report of the methods whose cells are all finished and deployed, once no cell is left to run.
 
@@ -122,12 +128,9 @@ def _write_report(experiment: Experiment, console: Console, record: ProgressReco
     """
     found = statuses(experiment, experiment.cells)
     failed = {each.cell.method: f"{each.cell.name}: {each.text}" for each in found if each.state == "failed"}
-    config = experiment.config
-    kept = tuple(
-        each for each in config.over.method if each in CONTROLS or name_in_results(each) not in failed
+    reported = _of_methods(
+        experiment, [name for name in experiment.config.method_names if name not in failed]
     )
-    over = config.over.model_copy(update={"method": kept})
-    reported = replace(experiment, config=config.model_copy(update={"over": over})) if failed else experiment
     done = {each.cell.name for each in found if each.state in FINISHED}
     files = {cell.name: experiment.cell_result(cell) for cell in reported.cells}
     missing = [name for name, file in files.items() if name not in done or not file.exists()]
@@ -147,6 +150,16 @@ def _write_report(experiment: Experiment, console: Console, record: ProgressReco
     with ProgressDisplay(console, record) as display:
         run_stages([_report_stage(reported, digests, notes)], experiment.folder, display)
     report.print_summary(reported, console)
+
+
+def _of_methods(experiment: Experiment, names: Sequence[str]) -> Experiment:
+    """The same experiment with some of its methods."""
+    config = experiment.config
+    kept = tuple(each for each in config.over.method if each in CONTROLS or name_in_results(each) in names)
+    if kept == config.over.method:
+        return experiment
+    over = config.over.model_copy(update={"method": kept})
+    return replace(experiment, config=config.model_copy(update={"over": over}))
 
 
 def _report_stage(experiment: Experiment, digests: dict[str, str], notes: Sequence[str] = ()) -> Stage:

@@ -16,7 +16,7 @@ import traceback
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Literal, NoReturn, TextIO
+from typing import Any, Literal, NoReturn, TextIO
 
 from advnerf_core.files import write_atomically
 from advnerf_core.plugins import exit_refused, in_one_line, is_signal
@@ -155,6 +155,7 @@ def run_in_process(job: Job) -> Ended:
 
 def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, report: Report) -> Ended:
     """Run a cell in this process, which holds the lock of live graphs if it needs it; an error is stored, and other cells continue."""
+    began = time.monotonic()
     store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
     try:
         lock = hold(store.lock_file(job.name))
@@ -162,30 +163,21 @@ def run_here(job: Job, store: Store, experiment: Experiment, bench: Bench, repor
         return Ended(job.name, "elsewhere", f"{job.name} is being run by process {held.owner}", 0.0)
     with lock:
         work = _begin(job, store, experiment)
-        return _attempt(job, store, work, experiment, report, bench)
+        try:
+            with exit_refused():
+                _run(job, store, work, experiment, report, bench)
+        except _OF_INPUTS as error:
+            return Ended(job.name, "lost", in_one_line(error), time.monotonic() - began)
+        except Exception as error:
+            text = in_one_line(error)
+            store.keep_error(job.name, job.settings_hash, text)
+            (work / LOG).write_text(traceback.format_exc(), encoding="utf-8")
+            return Ended(job.name, "failed", text, time.monotonic() - began)
+    return Ended(job.name, "done", _not_driven(job, store), time.monotonic() - began)
 
 
 def _begin(job: Job, store: Store, experiment: Experiment) -> Path:
     return store.begin(job.name, job.settings_hash, cell_settings(experiment, job.cell.inside))
-
-
-def _attempt(
-    job: Job, store: Store, work: Path, experiment: Experiment, report: Report, bench: Bench | None = None
-) -> Ended:
-    """Run a cell that is locked; an error is stored, and where it came from is added to the cell's log."""
-    began = time.monotonic()
-    try:
-        with exit_refused():
-            _run(job, store, work, experiment, report, bench)
-    except _OF_INPUTS as error:
-        return Ended(job.name, "lost", in_one_line(error), time.monotonic() - began)
-    except Exception as error:
-        text = in_one_line(error)
-        store.keep_error(job.name, job.settings_hash, text)
-        with open(work / LOG, "a", encoding="utf-8") as log:
-            traceback.print_exc(file=log)
-        return Ended(job.name, "failed", text, time.monotonic() - began)
-    return Ended(job.name, "done", _not_driven(job, store), time.monotonic() - began)
 
 
 def _not_driven(job: Job, store: Store) -> str:
@@ -212,11 +204,15 @@ def _run_job() -> None:
         work = _begin(job, store, experiment)
         with open(work / LOG, "a", encoding="utf-8", buffering=1) as log:
             os.dup2(log.fileno(), 1)
-        ended = _attempt(job, store, work, experiment, _log_progress())
-    if ended.how == "lost":
-        _end_changed(ended.text)
-    if ended.how == "failed":
-        raise SystemExit(_FAILED)
+            try:
+                with exit_refused():
+                    _run(job, store, work, experiment, _log_progress())
+            except _OF_INPUTS as error:
+                _end_changed(error)
+            except Exception as error:
+                traceback.print_exc(file=log)
+                store.keep_error(job.name, job.settings_hash, in_one_line(error))
+                raise SystemExit(_FAILED) from None
 
 
 def take_cell(store: Store, name: str) -> TextIO:
@@ -234,12 +230,8 @@ def take_cell(store: Store, name: str) -> TextIO:
 
 def _checked(job: Job, store: Store) -> Experiment:
     """The current experiment, checked before the cell is touched."""
-    from advnerf_core.parallel import set_thread_count
-
     try:
-        set_thread_count(job.threads)
-        if "torch" in sys.modules:  # importing it takes seconds, and not every kind of cell needs it
-            sys.modules["torch"].set_num_threads(job.threads)
+        _use_threads(job.threads)
         whole = load_experiment(Path(job.file), job.setting, job.overrides, Path(job.folder))
         experiment = whole.of(job.cell)
         if settings_hash(experiment, job.cell.inside) != job.settings_hash:
@@ -247,15 +239,15 @@ def _checked(job: Job, store: Store) -> Experiment:
                 f"{job.name}: its settings or inputs changed after the experiment was started; run it again"
             )
     except _OF_INPUTS as error:
-        _end_changed(in_one_line(error))
+        _end_changed(error)
     except Exception as error:
         store.keep_error(job.name, job.settings_hash, in_one_line(error))
         raise SystemExit(_FAILED) from None
     return experiment
 
 
-def _end_changed(text: str) -> NoReturn:
-    print(text, file=sys.stderr)
+def _end_changed(error: Exception) -> NoReturn:
+    print(in_one_line(error), file=sys.stderr)
     raise SystemExit(_CHANGED) from None
 
 
@@ -301,17 +293,24 @@ def _add_seconds(work: Path, seconds: float) -> float:
     return total
 
 
-def _log_progress() -> Report:
-    said_s = -_PROGRESS_PERIOD_S
+def _log_progress() -> Any:
+    said_s = [-_PROGRESS_PERIOD_S]
 
     def report(fraction: float, text: str = "") -> None:
-        nonlocal said_s
         now_s = time.monotonic()
-        if now_s - said_s >= _PROGRESS_PERIOD_S:
-            said_s = now_s
+        if now_s - said_s[0] >= _PROGRESS_PERIOD_S:
+            said_s[0] = now_s
             print(f"{100 * fraction:.0f} % {text}", flush=True)
 
     return report
+
+
+def _use_threads(threads: int) -> None:
+    from advnerf_core.parallel import set_thread_count
+
+    set_thread_count(threads)
+    if "torch" in sys.modules:  # importing it takes seconds, and not every kind of cell needs it
+        sys.modules["torch"].set_num_threads(threads)
 
 
 def _die_with(parent: int) -> None:

@@ -20,10 +20,12 @@ from advnerf_core.driving.path import Path
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.plugins import unknown
 from advnerf_core.policies.view import PolicyView
+from advnerf_core.run_module import search_folder_last
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import CarDescription
 from nodes.experiment.engine.run_folder import CELLS
 from nodes.experiment.plan.cell import Cell
+from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.sections import ResponseConfig
 from nodes.experiment.show.experiment_world import ExperimentWorld
@@ -52,6 +54,19 @@ class Experiment(ExperimentWorld):
 
     kept: Mapping[str, str] = field(default_factory=dict)
     given_scene: FilePath | None = None
+
+    @classmethod
+    def resolved_in(cls, folder: FilePath) -> Experiment:
+        """The experiment of a run folder, as its manifest resolved it."""
+        manifest = read_json(folder / "manifest.json")
+        context = {"folder": FilePath(manifest["file"]).parent}
+        search_folder_last(str(context["folder"]))  # may contain package.module:factory
+        stored = manifest["config"]
+        config = ExperimentConfig.model_validate(stored, context=context)
+        if given_in(config):  # these say what they see; a manifest has every section
+            stored = {name: section for name, section in stored.items() if name != "view"}
+            config = ExperimentConfig.model_validate(stored, context=context)
+        return cls(config, FilePath(manifest["file"]), folder, manifest["setting"]).with_given_scene()
 
     def with_given_scene(self) -> Experiment:
         """The same, which knows the learned scene of the user's own if that is the place."""
@@ -99,13 +114,7 @@ class Experiment(ExperimentWorld):
         Raises:
             ConfigError: An object stands in a lane, or has a rule and nothing is captured yet.
         """
-        objects, file = self.placed_by_hand, self.stage_folder("capture") / PLACED
-        if self.has_rules:
-            if not file.exists():
-                raise ConfigError(
-                    f"expected {file}, where the capture stage writes the places of objects with a rule; run that stage first"
-                )
-            objects = tuple(map(PlacedObject.model_validate, read_json(file)))
+        objects = self._objects_by_rule() if self.has_rules else self.placed_by_hand
         # Nothing meets what stands in a learned scene alone.
         if self.given_scene is None and (found := in_a_lane(objects, self.world)) is not None:
             raise ConfigError(f"{self.file}: objects.{found[0]}: {found[1]}")
@@ -120,6 +129,14 @@ class Experiment(ExperimentWorld):
     def has_rules(self) -> bool:
         """Whether a rule places an object."""
         return len(self.placed_by_hand) < len(self.config.objects)
+
+    def _objects_by_rule(self) -> tuple[PlacedObject, ...]:
+        file = self.stage_folder("capture") / PLACED
+        if not file.exists():
+            raise ConfigError(
+                f"expected {file}, where the capture stage writes the places of objects with a rule; run that stage first"
+            )
+        return tuple(map(PlacedObject.model_validate, read_json(file)))
 
     def goal(self, scenario: str) -> tuple[float, ...]:
         """Goal vector of a policy on a path; empty without a goal."""

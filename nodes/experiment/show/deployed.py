@@ -1,4 +1,4 @@
-"""The deployment, the car's camera images when opaque objects stand in a scene that gives colours and depth; and drives there and where it learned.
+"""The deployment: the car's camera images when opaque objects stand in a scene that gives colours and depth.
 
 Works with any `World`: per pixel the nearer of scene and object wins (the paper, section 4), in the camera's own pixels, and
 only then is the image cropped and resized for the policy.
@@ -17,8 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from advnerf_core.attack.adjoint import AttackProblem, evaluate
-from advnerf_core.attack.objective import JudgedDrives
 from advnerf_core.driving.dynamics import Motion
 from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
 from advnerf_core.driving.path import Path
@@ -31,9 +29,7 @@ from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import PoseBatch, Surrogate
 from hardware.cameras.effects import ImperfectCamera
 from hardware.worlds.world import Rgb, World, collided_with, require_depth
-from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.standing import bare_views, clear
-from nodes.experiment.show.victims import told
 
 # At a camera's own resolution a rasteriser takes one ray per pixel; the policy's resize averages three of them.
 _SUPERSAMPLE = 1
@@ -276,53 +272,3 @@ def drive_deployed(
     return DeployedDrive(
         states, rollout.controls[:, 0].double().numpy(), metrics, car.blocked_tick, collided_with=hit
     )
-
-
-def learned_drives(
-    experiment: Experiment, problem: AttackProblem, theta: Tensor
-) -> tuple[Array, Array, Sequence[DriveMetrics]]:
-    """States ``[B, T + 1, n]`` and commands ``[B, T]`` of the drives from all starts of a problem in its own scene, and their metrics."""
-    rollout, _ = evaluate(problem, theta)
-    states, commands = (each.transpose(0, 1).numpy() for each in (rollout.states, rollout.controls))
-    judged = JudgedDrives(rollout.states, problem.path, experiment.limits, experiment.world.fence_m)
-    return states, commands, judged.metrics
-
-
-def deployed_drives(
-    experiment: Experiment,
-    dressed: Dressed,
-    policy: Policy,
-    scenario: str,
-    starts: Tensor,
-    theta: Tensor | None,
-    report: Callable[[int], None] = lambda done: None,
-) -> list[DeployedDrive]:
-    """Drives through the deployment scene from starts ``[B, 3]``, with its own car or an ideal one; ``report`` gets the number of finished ones."""
-    effects, found = experiment.config.deploy.camera, []
-    car: SelfDriving | IdealDriving = IdealDriving(experiment.dynamics, experiment.world.fence_m)
-    if experiment.config.deploy.car == "own":
-        car = SelfDriving(dressed.scene, experiment.car.speed_mps, experiment.limits.dt_s)
-    for number, start in enumerate(starts.numpy()):
-        driven = drive_deployed(
-            dressed,
-            policy,
-            told(experiment, policy, scenario),
-            np.asarray(start),
-            experiment.paths[scenario],
-            experiment.limits,
-            car,
-            theta,
-            None if effects.ideal else ImperfectCamera(effects, experiment.camera, number),
-        )
-        found.append(driven)
-        report(len(found))
-    return found
-
-
-def totals(scores: Sequence[DriveMetrics]) -> dict[str, Any]:
-    """Total CTE [m], whether the track was left, and ticks until the car stopped, drive by drive."""
-    return {
-        "total_cte_m": [score.total_cte_m for score in scores],
-        "off_track": [score.off_track for score in scores],
-        "driven_ticks": [len(score.ctes_m) - score.held_ticks for score in scores],
-    }

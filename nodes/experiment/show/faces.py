@@ -1,12 +1,6 @@
-"""A face on a panel of the world: its object in the learned scene, the space of its colours, and its presentation in training and deployment.
-
-Of a panel that is a screen also its pictures of the face, and its measured colours for the driving camera.
-"""
+"""A face on a panel of the world: its object in the learned scene, the space of its colours, and its presentation in training and deployment."""
 
 from __future__ import annotations
-
-import math
-from collections.abc import Callable, Sequence
 
 import numpy as np
 from torch import Tensor
@@ -16,31 +10,17 @@ from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.attack.spaces.space import FaceMount, FaceSpace, NamedObject
 from advnerf_core.display import DisplayModel
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, face_corners_in_object
-from advnerf_core.geometry import (
-    Array,
-    invert_transform,
-    make_transform,
-    planar_pose,
-    planar_poses,
-    transform_points,
-)
+from advnerf_core.geometry import Array, invert_transform, make_transform, planar_pose, planar_poses
 from advnerf_core.plugins import unknown
 from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
-from calibration.display_colour import (
-    DisplayCalibration,
-    DisplayFit,
-    colours_to_show,
-    fit_display,
-    mean_colour,
-    screen_region,
-)
-from calibration.panel import MonitorPanel
+from calibration.display_colour import DisplayCalibration
 from calibration.schema import load_calibration
-from hardware.worlds.world import Panel, Rgb, Screens, World
+from hardware.worlds.world import Panel, Rgb, World
 from nodes.experiment.plan.carriers import FaceCarrier, ScreenConfig
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import Dressed
 from nodes.experiment.show.learned_scene import load_background
+from nodes.experiment.show.screen import cos_angle, face_picture, plain_picture, screens_of
 from nodes.runtime.errors import ConfigError
 
 # The deployed face lies this far in front of the panel that carries it, so that it is never inside it.
@@ -125,9 +105,8 @@ def mean_cos_angle(experiment: Experiment) -> float:
 
 
 def plain_screen(experiment: Experiment) -> Rgb:
-    """Picture of the screen without an attack: the face in one colour."""
-    colour = np.round(255.0 * np.asarray(wanted_face(experiment).plain_rgb))
-    return face_picture(panel_of(experiment), np.full((8, 8, 3), colour, np.uint8))
+    """Picture of the screen without an attack."""
+    return plain_picture(panel_of(experiment), wanted_face(experiment).plain_rgb)
 
 
 class PaintedScene(Dressed):
@@ -178,76 +157,3 @@ class PaintedScene(Dressed):
 
     def _texture(self, theta: Tensor) -> Rgb:
         return face_texture(theta.detach().numpy(), self._px)
-
-
-# Poses of the car for measuring the colours: distance [m], and angles to the panel's normal [rad] for the falloff.
-_DISTANCE_M, _ANGLES_RAD = 1.1, (0.0, 0.5, -0.85)
-
-
-def face_picture(panel: Panel, texture: Rgb) -> Rgb:
-    """A square face ``[n, n, 3]`` in true size in the middle of a black screen, as the monitor node shows it."""
-    assert panel.screen_px is not None, "a board shows no pictures"
-    pixels = MonitorPanel(panel.screen_px, (panel.width_m, panel.height_m))
-    return pixels.picture(texture, (panel.square_m, panel.square_m))
-
-
-def screens_of(world: World) -> Screens:
-    """The world, which must have screens.
-
-    Raises:
-        ConfigError: The world cannot show a picture.
-    """
-    if not isinstance(world, Screens):
-        raise ConfigError(
-            f"expected a world with a method show(panel, rgb), as one of its panels is a screen, got {type(world).__name__} without"
-        )
-    return world
-
-
-def cos_angle(panel: Panel, points: Array) -> Array:
-    """Cosine ``[...]`` of the angle between a panel's normal and the direction to points ``[..., 3]``."""
-    seen = transform_points(invert_transform(panel.T_world_from_face), points)
-    return np.asarray(seen[..., 0] / np.linalg.norm(seen, axis=-1), dtype=np.float64)
-
-
-def measure_display(
-    world: World,
-    name: str,
-    panel: Panel,
-    seed: int = 0,
-    frames_of: Callable[[Rgb], Sequence[Rgb]] | None = None,
-) -> DisplayFit:
-    """Show the calibration's colours on a screen, look at them from three poses, and fit the display model.
-
-    Args:
-        world: The open world; its screen shows the last colour afterwards.
-        frames_of: Converts a rendered picture to camera frames, such as several noisy ones; None uses the picture itself.
-    """
-    colours, screens = colours_to_show(seed=seed), screens_of(world)
-    shown, seen, cosines = [], [], []
-    for angle in _ANGLES_RAD:
-        car = _car_before(panel, world.T_car_from_camera, angle)
-        camera = transform_points(planar_pose(*car), world.T_car_from_camera[:3, 3])
-        pictures = []
-        for colour in colours:
-            screens.show(name, np.full((2, 2, 3), colour, np.uint8))
-            picture = world.observe_at(*car, depth=False)[0]
-            pictures.append([picture] if frames_of is None else frames_of(picture))
-        region = screen_region(pictures[0][0], pictures[1][0])
-        seen += [mean_colour(frames, region) for frames in pictures]
-        shown += list(colours / 255.0)
-        cosines += [float(cos_angle(panel, camera))] * len(colours)
-    return fit_display(np.array(shown), np.array(seen), np.array(cosines))
-
-
-def _car_before(panel: Panel, T_car_from_camera: Array, angle_rad: float) -> tuple[float, float, float]:
-    """Pose of a car on the floor whose camera looks at a panel from an angle to its normal: x [m], y [m], yaw [rad]."""
-    face, ahead_m = panel.T_world_from_face, float(T_car_from_camera[0, 3])
-    place = face @ np.array([_DISTANCE_M * math.cos(angle_rad), _DISTANCE_M * math.sin(angle_rad), 0.0, 1.0])
-    towards = face[:3, 3] - place[:3]
-    heading = math.atan2(towards[1], towards[0])
-    return (
-        float(place[0] - ahead_m * math.cos(heading)),
-        float(place[1] - ahead_m * math.sin(heading)),
-        heading,
-    )

@@ -42,8 +42,7 @@ def stand_in(
         return DressedScene(scene, experiment.view, objects)
     things = experiment.objects if objects else ()
     surfaces = [
-        # Made of voxels, and no panel.
-        surface_of(thing.kind) if isinstance(field, VoxelGridObject) and field.face_size_m is None else None
+        surface_of(thing.kind) if _is_solid(field) else None
         for thing, field in zip(things, objects, strict=True)
     ]
     return NativeScene(scene, experiment.view, objects, surfaces)
@@ -182,6 +181,11 @@ class _Solid:
 
 def _refused(what: str, scene: World) -> str:
     return f"expected a world that takes {what} with carrier.kind native, got {type(scene).__name__}; set carrier.kind=composed"
+
+
+def _is_solid(field: ColouredObject) -> bool:
+    """Whether an object is made of voxels and is no panel."""
+    return isinstance(field, VoxelGridObject) and field.face_size_m is None
 
 
 def _thing(scene: World, field: ColouredObject, surface: SurfaceMesh | None) -> _Board | _Solid:

@@ -54,12 +54,9 @@ def own_objects(experiment: Experiment) -> list[OwnObject]:
 
 
 def _own_object(experiment: Experiment, thing: PlacedObject) -> OwnObject:
-    space, wanted = experiment.config.space, thing.mesh
-    if wanted is None and isinstance(space, (MeshTextureConfig, MeshShapeConfig)):
-        wanted = MeshConfig(texels=space.texels)
     if thing.kind in FLAT:
         field: VoxelGridObject | MeshField = flat_object(experiment, thing)
-    elif wanted is not None:
+    elif (wanted := _as_mesh(experiment, thing)) is not None:
         field, file_sha256 = _mesh(thing, wanted)
         if file_sha256:
             return OwnObject(field, NamedObject(thing.name, hash_of([field.sha256, file_sha256])))
@@ -90,14 +87,7 @@ def flat_object(
         depth_m=face.size_m if thing.kind == CUBE else _SLAB_M,
     )
     if own and (border := _border_of(experiment, thing)) is not None:
-        # As the camera sees it: one mean colour for each cell of the face's size.
-        marker_m, across = border
-        frame = frame_around((thing.side_m, thing.side_m), 0, marker_m)
-        count = _resolution(experiment, face) + 2 * across
-        at_m = (np.arange(count * _FINER) + 0.5) / (count * _FINER) * frame.sheet_m[0]
-        inked, (display, _) = frame.drawn(at_m, at_m) / 255.0, display_of(face)
-        shown = inked if display is None else display.forward(inked)
-        field = with_border(field, shown.reshape(count, _FINER, count, _FINER, 3).mean(axis=(1, 3)))
+        field = with_border(field, _drawn(experiment, thing, *border))
     return replace(field, scale=field.scale * thing.scale)
 
 
@@ -111,6 +101,25 @@ def _border_of(experiment: Experiment, thing: PlacedObject) -> tuple[float, int]
     if face is None or face.marker_m is None:
         return None
     return whole_cells(thing.side_m, _resolution(experiment, face), face.marker_m)
+
+
+def _drawn(experiment: Experiment, thing: PlacedObject, marker_m: float, across: int) -> Array:
+    """The border of a print as the camera sees it: one mean colour for each cell of the face's size ``[n, n, 3]``."""
+    face = thing.face or FaceConfig()
+    frame = frame_around((thing.side_m, thing.side_m), 0, marker_m)
+    count = _resolution(experiment, face) + 2 * across
+    at_m = (np.arange(count * _FINER) + 0.5) / (count * _FINER) * frame.sheet_m[0]
+    inked = frame.drawn(at_m, at_m) / 255.0
+    display, _ = _display_of(face)
+    seen = inked if display is None else display.forward(inked)
+    return np.asarray(seen.reshape(count, _FINER, count, _FINER, 3).mean(axis=(1, 3)))
+
+
+def _as_mesh(experiment: Experiment, thing: PlacedObject) -> MeshConfig | None:
+    space = experiment.config.space
+    if thing.mesh is None and isinstance(space, (MeshTextureConfig, MeshShapeConfig)):
+        return MeshConfig(texels=space.texels)
+    return thing.mesh
 
 
 def _mesh(thing: PlacedObject, wanted: MeshConfig) -> tuple[MeshField, str]:
@@ -143,8 +152,12 @@ def mount_of(experiment: Experiment) -> FaceMount | None:
     return None
 
 
-def display_of(face: FaceConfig | None) -> tuple[DisplayModel | None, float]:
-    """The measured monitor or printer that shows a face, and the cosine of a monitor's viewing angle; None without one."""
+def display_of(experiment: Experiment) -> tuple[DisplayModel | None, float]:
+    """The measured monitor or printer that shows the only object, and the cosine of a monitor's viewing angle; None without one."""
+    return _display_of(experiment.objects[0].face)
+
+
+def _display_of(face: FaceConfig | None) -> tuple[DisplayModel | None, float]:
     if face is None or face.display is None:
         return None, 1.0
     return load_calibration(DisplayCalibration, face.display).display, face.display_cos

@@ -54,7 +54,7 @@ def colour_space(experiment: Experiment, surrogate: Surrogate | None = None) -> 
     behind, named = surrogate or _surrogate(experiment), named_objects(experiment)
     if experiment.given_scene is None:
         return ColourSpace(behind, named, light_on_panels(experiment))
-    light, cos_angle = display_of(experiment.objects[0].face)
+    light, cos_angle = display_of(experiment)
     return ColourSpace(behind, named, light, cos_angle, mount_of(experiment))
 
 
@@ -70,15 +70,7 @@ def make_space(experiment: Experiment, scene: World | None) -> Space:
         return _place_space(experiment, wanted)
     if over_the_world(experiment):
         assert scene is not None, "meshes are searched over the pictures of an open scene"
-        assert isinstance(wanted, (MeshTextureConfig, MeshShapeConfig)), (
-            "others are searched in a learned scene"
-        )
-        fields, frames = mesh_objects(experiment, wanted), DeployedFrames(scene, experiment.view)
-        surrogate = Surrogate(
-            frames, experiment.view.pinhole, experiment.mount, fields, depth_tolerance_m=0.0
-        )
-        things = zip(experiment.objects, fields, strict=True)
-        named = [NamedObject(thing.name, field.sha256) for thing, field in things]
+        surrogate, named = _over_pictures(experiment, scene)
     else:
         surrogate, named = _surrogate(experiment), named_objects(experiment)
     if isinstance(wanted, ColoursConfig):
@@ -87,6 +79,16 @@ def make_space(experiment: Experiment, scene: World | None) -> Space:
         return ColourSpace(surrogate, named)
     limits = ShapeLimits(wanted.bound_m, wanted.smoothness, wanted.samples, wanted.boundary_samples)
     return ShapeSpace(surrogate, named, limits)
+
+
+def _over_pictures(experiment: Experiment, scene: World) -> tuple[Surrogate, list[NamedObject]]:
+    """The objects as meshes over the pictures of an open scene."""
+    wanted = experiment.config.space
+    assert isinstance(wanted, (MeshTextureConfig, MeshShapeConfig)), "others are searched in a learned scene"
+    fields, frames = mesh_objects(experiment, wanted), DeployedFrames(scene, experiment.view)
+    surrogate = Surrogate(frames, experiment.view.pinhole, experiment.mount, fields, depth_tolerance_m=0.0)
+    things = zip(experiment.objects, fields, strict=True)
+    return surrogate, [NamedObject(thing.name, field.sha256) for thing, field in things]
 
 
 def _surrogate(experiment: Experiment) -> Surrogate:
@@ -170,20 +172,18 @@ def random_placements(experiment: Experiment, count: int, seed: int) -> list[tup
     )
 
 
+def geometry_sha256(experiment: Experiment, kind: str) -> str:
+    """Hash of the object file of a kind; for a panel, the hash of the panel at scale 1."""
+    if kind == PANEL:
+        return panel_object(experiment, MADE_HERE_M[PANEL][1]).sha256
+    return content_sha256(object_file(experiment, kind))
+
+
 def named_objects(experiment: Experiment) -> list[NamedObject]:
     """Descriptions of the objects in the learned scene for attack files."""
     if experiment.given_scene is not None:
         return [each.named for each in own_objects(experiment)]
-    return [
-        NamedObject(
-            thing.name,
-            # A panel at scale 1.
-            panel_object(experiment, MADE_HERE_M[PANEL][1]).sha256
-            if thing.kind == PANEL
-            else content_sha256(object_file(experiment, thing.kind)),
-        )
-        for thing in experiment.objects
-    ]
+    return [NamedObject(thing.name, geometry_sha256(experiment, thing.kind)) for thing in experiment.objects]
 
 
 def _place_space(experiment: Experiment, wanted: PlacesConfig) -> PlaceSpace:

@@ -47,12 +47,7 @@ def make_stand(world: World, wanted: Sequence[Standing], put: Callable[[int], No
     standing = list(standing_in(world))
     names = {each[:2] for each in wanted}
     for each in [one for one in standing if one[:2] not in names]:
-        if each.is_mesh:
-            assert isinstance(world, NativeMeshes), "it took the mesh"
-            world.add_mesh(each.name, None)
-        else:
-            assert isinstance(world, NativePanels), "it took the panel"
-            world.add_panel(each.name, Panel(np.eye(4), 1.0, 1.0), None)
+        _take_out(world, each)
         standing.remove(each)
         _STANDING[world] = tuple(standing)
     for number, each in enumerate(wanted):
@@ -97,3 +92,12 @@ class DeployedFrames:
             rgb.append(self.view.image(image))
             depth_m.append(cv2.resize(depth[self.view.window], size, interpolation=cv2.INTER_NEAREST_EXACT))
         return np.stack(rgb).astype(np.float32) / np.float32(255.0), np.stack(depth_m).astype(np.float32)
+
+
+def _take_out(world: World, thing: Standing) -> None:
+    if thing.is_mesh:
+        assert isinstance(world, NativeMeshes), "it took the mesh"
+        world.add_mesh(thing.name, None)
+    else:
+        assert isinstance(world, NativePanels), "it took the panel"
+        world.add_panel(thing.name, Panel(np.eye(4), 1.0, 1.0), None)

@@ -33,7 +33,7 @@ from advnerf_core.policies.policy_file import LoadedPolicy
 from advnerf_core.report.conditions import EMPTY
 from hardware.worlds.world import World
 from nodes.experiment.engine.artefact import Settings, hash_of
-from nodes.experiment.engine.run_folder import ATTACK, FROZEN, SEARCHED
+from nodes.experiment.engine.run_folder import ATTACK, SEARCHED
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.method_names import keep_title
 from nodes.experiment.plan.space_config import (
@@ -43,11 +43,12 @@ from nodes.experiment.plan.space_config import (
     PlacesConfig,
 )
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import Dressed, learned_drives, totals
+from nodes.experiment.show.deployed import Dressed
+from nodes.experiment.show.drives import learned_drives, totals
 from nodes.experiment.show.learned_scene import baked_file, load_field, scene_sha256
 from nodes.experiment.show.spaces import dress, over_the_world, shown_there
 from nodes.experiment.show.victims import load_victim, told
-from nodes.experiment.steps.frozen import frozen_for
+from nodes.experiment.steps.frozen import frozen_for, hardness_before
 from nodes.experiment.steps.keys import registered_settings, search_key
 from nodes.runtime.errors import ConfigError
 
@@ -173,8 +174,7 @@ def surrogate_part(
     data = {
         "attack_id": attack_id,
         "policy_sha256": prepared.policy.sha256,
-        # The victim's passing verdict when the search began.
-        "hardness": str(read_json(folder / FROZEN).get("hardness", "")) if (folder / FROZEN).exists() else "",
+        "hardness": hardness_before(folder),
         **surrogate_drives(experiment, space, cell, folder),
         "curve_total_cte_m": curve,
         **values,

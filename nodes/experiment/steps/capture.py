@@ -17,18 +17,11 @@ from calibration.schema import save_calibration
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.world import Photograph, Photographed, World
 from nodes.experiment.show.context import CALIBRATION, PLACED, Experiment
-from nodes.experiment.show.faces import (
-    DISPLAY,
-    measure_display,
-    on_screen,
-    panel_of,
-    plain_screen,
-    screens_of,
-    wanted_face,
-)
+from nodes.experiment.show.faces import DISPLAY, on_screen, panel_of, plain_screen, wanted_face
 from nodes.experiment.show.learned_scene import HELD_OUT
 from nodes.experiment.show.light import LIGHT, light_remark, measure_light
 from nodes.experiment.show.placing import place_by_rule
+from nodes.experiment.show.screen import measure_display, screens_of
 from nodes.runtime.progress import Report, counted
 
 PHOTOS, COLOUR_PAIRS = "photos", "colour_pairs"
@@ -43,11 +36,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     with experiment.open_world() as scene:
         experiment.keep_world(scene)
         if isinstance(scene, Photographed):
-            # A place that is known by photographs: both sets are imported.
-            learned, views = scene.photographs(config.held_out)
-            total = len(learned) + len(views)
-            _write(folder / PHOTOS, learned, counted(report, PHOTOS, len(learned), 0, total))
-            _write(folder / HELD_OUT, views, counted(report, HELD_OUT, len(views), len(learned), total))
+            _take_over(scene, config.held_out, folder, report)
             return
         if experiment.has_rules:
             report(0.0, "placing objects")
@@ -76,6 +65,14 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         ):
             if count:
                 _driving_views(experiment, scene, name, count, rng, done, folder, report)
+
+
+def _take_over(place: Photographed, held_out: int, folder: Path, report: Report) -> None:
+    """Import both sets of a place that is known by photographs."""
+    learned, views = place.photographs(held_out)
+    total = len(learned) + len(views)
+    _write(folder / PHOTOS, learned, counted(report, PHOTOS, len(learned), 0, total))
+    _write(folder / HELD_OUT, views, counted(report, HELD_OUT, len(views), len(learned), total))
 
 
 def _write(folder: Path, photographs: Sequence[Photograph], told: Callable[[int], None]) -> None:

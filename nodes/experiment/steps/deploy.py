@@ -18,7 +18,8 @@ from hardware.worlds.world import World
 from nodes.experiment.engine.run_folder import ATTACK, SEARCHED, THETA
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import DeployedDrive, deployed_drives, totals
+from nodes.experiment.show.deployed import DeployedDrive
+from nodes.experiment.show.drives import deployed_drives, totals
 from nodes.experiment.show.victims import load_victim
 from nodes.experiment.steps.attack import dress_cell
 from nodes.experiment.steps.live import LiveNodes, LiveRun, as_drive, drive_until_it_counts
@@ -34,6 +35,20 @@ def drive_through_world(
     policy, starts = load_victim(experiment, cell.victim).policy, deployed_starts(experiment, cell)
     dressed, colours = dress_cell(experiment, scene, space, folder, cell)
     return deployed_drives(experiment, dressed, policy, cell.scenario, starts, colours)
+
+
+def _through_nodes(
+    experiment: Experiment, nodes: LiveNodes, cell: Cell, folder: Path, tell: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Measurements of one live drive per start, each with the folder of its bag."""
+    attack = None if cell.method == NONE else (folder / ATTACK).resolve()
+    found = []
+    for number, start in enumerate(deployed_starts(experiment, cell).tolist()):
+        name = live_name(number)
+        live = LiveRun(name, cell.victim, cell.scenario, (start[0], start[1], start[2]), attack)
+        driven = drive_until_it_counts(experiment, live, folder, tell, nodes)
+        found.append({"run": name, **driven})
+    return found
 
 
 def live_name(start: int) -> str:
@@ -106,14 +121,8 @@ def cell_data(
             "blocked_tick": driven["blocked_tick"],
             "max_abs_cte_m": max(driven["max_cte_m"]),
             "off_track_m": experiment.limits.off_track_m,
+            **_live_extra(driven["live"]),
         }
-        if live := driven["live"]:
-            data["extra"] |= {
-                "stopped_early": [each["outcome"]["stopped_early"] for each in live],
-                "missed_frames": [each["missed"] for each in live],
-                "spoiled_tries": [each["spoiled"] for each in live],
-                "time_to_leave_s": [each["metrics"]["time_to_leaving_s"] for each in live],
-            }
     return data
 
 
@@ -122,6 +131,18 @@ def _drives_of(found: Mapping[str, Any], without_m: Sequence[float]) -> dict[str
         "total_cte_m": found["total_cte_m"],
         "off_track": found["off_track"],
         "none_total_cte_m": list(without_m),
+    }
+
+
+def _live_extra(live: list[dict[str, Any]]) -> dict[str, Any]:
+    """Values that only live drives have, per start."""
+    if not live:
+        return {}
+    return {
+        "stopped_early": [each["outcome"]["stopped_early"] for each in live],
+        "missed_frames": [each["missed"] for each in live],
+        "spoiled_tries": [each["spoiled"] for each in live],
+        "time_to_leave_s": [each["metrics"]["time_to_leaving_s"] for each in live],
     }
 
 
@@ -140,11 +161,7 @@ def _deployed_part(
         return found
     live: list[dict[str, Any]] = []
     if isinstance(place, LiveNodes):
-        attack = None if cell.method == NONE else (folder / ATTACK).resolve()
-        for number, (x_m, y_m, yaw_rad) in enumerate(deployed_starts(experiment, cell).tolist()):
-            wanted = LiveRun(live_name(number), cell.victim, cell.scenario, (x_m, y_m, yaw_rad), attack)
-            driven = drive_until_it_counts(experiment, wanted, folder, tell, place)
-            live.append({"run": wanted.name, **driven})
+        live = _through_nodes(experiment, place, cell, folder, tell)
         drives = [as_drive(experiment, each) for each in live]
     else:
         drives = drive_through_world(experiment, place, space, cell, folder)

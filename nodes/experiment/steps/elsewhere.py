@@ -10,12 +10,13 @@ import copy
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from advnerf_core.documents import Document
 from advnerf_core.learning.recipe import SourcePlan
-from advnerf_core.learning.sources import FrameSource, RenderedSource
+from advnerf_core.learning.sources import RenderedSource
 from hardware.worlds.world import World
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.deployed import seen_in
@@ -60,7 +61,7 @@ def place_elsewhere(
     world = opened.enter_context(there.named_world.make())
     found = world.describe()
     if differ := [
-        name for name in _SAME if not np.array_equal(getattr(found, name), getattr(experiment.world, name))
+        name for name in _SAME if not _equal(getattr(found, name), getattr(experiment.world, name))
     ]:
         raise ConfigError(
             f"{experiment.file}: policy.learns_in: expected places with the {', '.join(_SAME)} of the attacked one, got other "
@@ -73,6 +74,10 @@ def place_elsewhere(
     except ConfigError as error:
         raise ConfigError(f"policy.learns_in: {' '.join(changes)}: {error}") from error
     return there, world
+
+
+def _equal(one: Any, other: Any) -> bool:
+    return bool(np.array_equal(one, other)) if isinstance(one, np.ndarray) else bool(one == other)
 
 
 def _plans(there: Experiment, world: World, place: str) -> list[SourcePlan]:
@@ -95,21 +100,16 @@ def _plans(there: Experiment, world: World, place: str) -> list[SourcePlan]:
             ),
         )
         for which, source in enumerate(sources):
-            halves = (wanted.deployed_stills + which) // 2, (wanted.deployed_drives + which) // 2
-            found.append(plan_of(there, name, source, *halves))
+            found.append(
+                SourcePlan(
+                    source,
+                    (wanted.deployed_stills + which) // 2,
+                    (wanted.deployed_drives + which) // 2,
+                    wanted.drive_steps,
+                    goal=there.goal(name),
+                    expert=there.expert(name),
+                    driven_m=wanted.driven_m,
+                    drives_from_m=wanted.drives_from_m,
+                )
+            )
     return found
-
-
-def plan_of(experiment: Experiment, path: str, source: FrameSource, stills: int, drives: int) -> SourcePlan:
-    """So many frames of a source along a path, with its goal and its teacher."""
-    wanted = experiment.config.policy
-    return SourcePlan(
-        source,
-        stills,
-        drives,
-        wanted.drive_steps,
-        goal=experiment.goal(path),
-        expert=experiment.expert(path),
-        driven_m=wanted.driven_m,
-        drives_from_m=wanted.drives_from_m,
-    )

@@ -7,6 +7,7 @@ calibration predicts for the camera. No drive with the attack is used.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from nodes.control.pose_buffer import PoseBuffer
 from nodes.experiment.engine.run_folder import ATTACK
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import deployed_drives
+from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.faces import face_space, has_face, on_screen, panel_of
 from nodes.experiment.show.learned_scene import HELD_OUT, captured
 from nodes.experiment.show.objects import surrogate_of
@@ -145,13 +146,17 @@ def _measured_car(experiment: Experiment, clean: Path) -> RespondingCar:
     # Commands of live drives are in their bags, each with a delay of its own.
     if experiment.config.deploy.car == "ideal" or experiment.config.deploy.live or not kept.exists():
         return RespondingCar(ideal, CarResponse(ideal.speed_mps))
-    # Of each drive until it stood against something.
-    found, poses, controls = read_json(kept), [], []
-    for tick, states, commands in zip(found["blocked_tick"], found["states"], found["commands"], strict=True):
-        end = tick or len(commands)
-        poses.append(np.array(states)[: end + 1])
-        controls.append(np.array(commands)[:end])
-    return RespondingCar(ideal, fit_response(poses, controls, ideal))
+    return RespondingCar(ideal, fit_response(*_until_blocked(read_json(kept)), ideal))
+
+
+def _until_blocked(kept: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
+    """Poses ``[T + 1, 3]`` and commands ``[T]`` of each kept drive, until it stood against something."""
+    ends = [
+        tick or len(commands) for tick, commands in zip(kept["blocked_tick"], kept["commands"], strict=True)
+    ]
+    poses = [np.array(each)[: end + 1] for each, end in zip(kept["states"], ends, strict=True)]
+    controls = [np.array(each)[:end] for each, end in zip(kept["commands"], ends, strict=True)]
+    return poses, controls
 
 
 def _found(experiment: Experiment, cell: Cell, folder: Path) -> tuple[Space, AttackFile]:

@@ -68,7 +68,7 @@ def film_cell(
 def _learned_track(experiment: Experiment, space: Space, cell: Cell, title: str, folder: Path) -> ClipTrack:
     """What the policy saw on the first drive of a cell in the learned scene."""
     every, _ = filmed(experiment.config.dt_s)
-    states, shown = states_in(folder / SEARCHED)[0][::every], load_shown(space, folder, cell)
+    states, shown = _states(folder / SEARCHED)[0][::every], load_shown(space, folder, cell)
     sensor = shown.seen_by(space.surrogate)
     poses = planar_poses(states) @ experiment.mount
     frames = [tensor_to_images(sensor.render(pose[None], shown.colours).images)[0] for pose in poses]
@@ -86,7 +86,7 @@ def _deployed_track(
     """Images of the first deployed drive of a cell: rendered again by the open scene, or from the bag of a live drive."""
     every, _ = filmed(experiment.config.dt_s)
     file = folder / DRIVES
-    states = states_in(file)[0][::every]
+    states = _states(file)[0][::every]
     if scene is None:
         live = read_json(file)["live"][0]
         began_ns, period_s = live["outcome"]["start_real_ns"], every * experiment.config.dt_s
@@ -116,6 +116,10 @@ def _track(
     return ClipTrack(title, cell.method, frames, cte_m, attack_id, note)
 
 
-def states_in(file: Path) -> list[Array]:
-    """States ``[T + 1, 3]`` of the drives in a file of a cell."""
+def drives_of(experiment: Experiment, domain: str, cell: Cell) -> list[Array]:
+    """States ``[T + 1, 3]`` of a cell's drives in one domain."""
+    return _states(driven_folder(experiment, cell) / (SEARCHED if domain == "surrogate" else DRIVES))
+
+
+def _states(file: Path) -> list[Array]:
     return [np.array(states)[:, :3] for states in read_json(file)["states"]]

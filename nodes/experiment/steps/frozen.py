@@ -77,6 +77,11 @@ def freeze(experiment: Experiment, cell: Cell, folder: Path) -> None:
         write_json(folder / FROZEN, fixed)
 
 
+def hardness_before(folder: Path) -> str:
+    """Digest of the victim's passing verdict when a search began; empty without one."""
+    return str(read_json(folder / FROZEN).get("hardness", "")) if (folder / FROZEN).exists() else ""
+
+
 def check_frozen(experiment: Experiment, cell: Cell, folder: Path) -> None:
     """Raise if scene, victims, objects, places or starts differ from the search's.
 

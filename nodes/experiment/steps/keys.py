@@ -99,8 +99,7 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
     if trained is not None and trained.textures != ("none" if cell.victim == NAIVE else "random"):
         inputs["textures"] = trained.textures
     if cell.victim in (*given_victims, RETRAINED):
-        missing = cell.victim == RETRAINED and not Path(victim_spec(experiment, RETRAINED)).exists()
-        inputs["policy_sha256"] = None if missing else victim_sha256(experiment, cell.victim)
+        inputs["policy_sha256"] = _policy_sha256(experiment, cell.victim)
     if not deployed:
         # Objects are searched in the same way for any presentation to the car.
         free |= (
@@ -114,6 +113,13 @@ def cell_settings(experiment: Experiment, cell: Cell, deployed: bool = True) -> 
     return made.noting(
         **_object_files(config)
     )  # a registration has them, which cannot know the digests of stages
+
+
+def _policy_sha256(experiment: Experiment, victim: str) -> str | None:
+    """Content hash of a policy that the stage policy does not make; None for one that is not retrained yet."""
+    if victim == RETRAINED and not Path(victim_spec(experiment, victim)).exists():
+        return None
+    return victim_sha256(experiment, victim)
 
 
 def _common_inputs(experiment: Experiment, deployed: bool = True) -> dict[str, Any]:
@@ -209,18 +215,18 @@ def require_searchable(experiment: Experiment, cells: Sequence[Cell]) -> None:
     for cell in cells:
         inside = experiment.of(cell)
         try:
-            objective = inside.config.attack.objective  # a built-in one was checked when the file was read
-            if (
-                objective not in OBJECTIVES
-                and load_objective(objective).needs_solids
-                and inside.solids is None
-            ):
-                raise NoSuchCellError(f"{inside.file}: {without_solids(inside)}")
+            _require_objective(inside)
             if cell.searched and cell.code not in METHODS:
                 load_method(cell.code)
         except PluginError as error:
             raise NoSuchCellError(f"{experiment.file}: {error}") from None
         _require_gradient(inside, cell)
+
+
+def _require_objective(experiment: Experiment) -> None:
+    objective = experiment.config.attack.objective  # a built-in one was checked when the file was read
+    if objective not in OBJECTIVES and load_objective(objective).needs_solids and experiment.solids is None:
+        raise NoSuchCellError(f"{experiment.file}: {without_solids(experiment)}")
 
 
 def without_solids(experiment: Experiment) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timin
 from nodes.lab.trials.trial import TrialOutcome, TrialPlan
 from nodes.lab.trials.trial_runner import TrialNodes
 from nodes.lab.trials.tries import NotDrivenError, drive_with_tries
-from nodes.launching.launch_file import load_launch
+from nodes.launching.launch_file import Plan, load_launch
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.progress import Report
@@ -103,12 +103,7 @@ def check_live(experiment: Experiment, place: str) -> None:
         graph = load_launch(experiment.launch_file, wanted.changes)
     except ConfigError as error:
         raise ConfigError(f"{place}: changes: {error}") from error
-    from nodes.motor import MotorConfig  # loads the drivers of its devices
-
-    # The largest age of a command: as the motor node is configured, or that node's default.
-    motor = (graph.resolved["nodes"].get("motor") or {}).get("config") or {}
-    default = MotorConfig.model_fields["command_age_limit_s"].default
-    limit_s = float(motor.get("command_age_limit_s", default))
+    limit_s = _command_age_limit_s(graph)
     if wanted.camera.lost and 2.0 / rate_hz + _LEAST_LATENCY_S >= limit_s:
         raise ConfigError(
             f"{place}: expected deploy.camera with lost 0, as at {rate_hz:g} Hz the first lost frame leaves the car without a command for "
@@ -116,7 +111,16 @@ def check_live(experiment: Experiment, place: str) -> None:
         )
 
 
-class LiveNodes(AbstractContextManager["LiveNodes"]):
+def _command_age_limit_s(graph: Plan) -> float:
+    """Largest age of a command in a node graph [s]: as its motor node is configured, or that node's default."""
+    from nodes.motor import MotorConfig  # loads the drivers of its devices
+
+    default = MotorConfig.model_fields["command_age_limit_s"].default
+    motor = graph.resolved["nodes"].get("motor") or {}
+    return float((motor.get("config") or {}).get("command_age_limit_s", default))
+
+
+class LiveNodes:
     """The live nodes of an experiment, which are started for the first drive and kept for the next ones; see `TrialNodes`."""
 
     def __init__(self, experiment: Experiment) -> None:
@@ -124,6 +128,9 @@ class LiveNodes(AbstractContextManager["LiveNodes"]):
         ready_timeout_s = experiment.config.deploy.ready_timeout_s
         self.graph = TrialNodes(experiment.launch_file, experiment.folder / NODES, ready_timeout_s)
         self._vicon_port = 0
+
+    def __enter__(self) -> LiveNodes:
+        return self
 
     def __exit__(self, *raised: object) -> None:
         self.graph.close()
@@ -172,11 +179,7 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path, nodes: LiveN
     last_frame_ns = outcome.end_real_ns - round(horizon.dt_s * NS_PER_S)
     times = timing(bag, outcome.start_real_ns, last_frame_ns)
     drawn = sorted(attack_ids(bag))
-    expected = [load_attack(live.attack).attack_id] if live.attack is not None else []
-    if drawn != expected:
-        raise RuntimeFault(
-            f"expected the attacks {expected} in the frames of run {live.name}, got {drawn}: {why_not_shown(bag)}"
-        )
+    _check_drawn(live, bag, drawn)
     result: dict[str, Any] = {
         "victim": live.victim,
         "attack_ids": drawn,
@@ -260,3 +263,11 @@ def _horizon(experiment: Experiment, live: LiveRun) -> Horizon:
     """Control ticks over which a run is measured."""
     limits = experiment.limits
     return limits if live.ticks is None else replace(limits, ticks=live.ticks)
+
+
+def _check_drawn(live: LiveRun, bag: Path, drawn: list[str]) -> None:
+    expected = [load_attack(live.attack).attack_id] if live.attack is not None else []
+    if drawn != expected:
+        raise RuntimeFault(
+            f"expected the attacks {expected} in the frames of run {live.name}, got {drawn}: {why_not_shown(bag)}"
+        )

@@ -78,18 +78,8 @@ def stages_of_cells(experiment: Experiment) -> list[Stage]:
     """
     config = experiment.config
     if config.own_scene:
-        scene = load_hash(Path(str(experiment.named_world.config.file)))
-        unread, inputs = (
-            {"measure": True, "scene": True},
-            {"scene": scene, "world": experiment.world_settings},
-        )
-        return [_bake(experiment, (), unread, **inputs)]
-    found = [
-        _capture(experiment),
-        _scene(experiment),
-        _bake(experiment, ("capture", "scene")),
-        _object(experiment),
-    ]
+        return [_bake_own(experiment, Path(str(experiment.named_world.config.file)))]
+    found = [_capture(experiment), _scene(experiment), _bake(experiment), _object(experiment)]
     by_stage = {config.policy_stage(name): name for name in config.trained}
     found += [
         _policy(stage, replace(experiment, config=config.training(name))) for stage, name in by_stage.items()
@@ -133,9 +123,15 @@ def _scene(experiment: Experiment) -> Stage:
     )
 
 
-def _bake(experiment: Experiment, after: Sequence[str], unread: Any = None, **inputs: Any) -> Stage:
-    settings = Settings.of(experiment.config, READS["bake"], unread, view=experiment.view_settings, **inputs)
-    return _stage("bake", bake.run, experiment, settings, after)
+def _bake(experiment: Experiment) -> Stage:
+    settings = Settings.of(experiment.config, READS["bake"], view=experiment.view_settings)
+    return _stage("bake", bake.run, experiment, settings, ("capture", "scene"))
+
+
+def _bake_own(experiment: Experiment, file: Path) -> Stage:
+    inputs = {"view": experiment.view_settings, "scene": load_hash(file), "world": experiment.world_settings}
+    settings = Settings.of(experiment.config, READS["bake"], {"measure": True, "scene": True}, **inputs)
+    return _stage("bake", bake.run, experiment, settings)
 
 
 def _object(experiment: Experiment) -> Stage:

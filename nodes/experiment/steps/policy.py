@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,7 +43,7 @@ from nodes.experiment.show.objects import (
 )
 from nodes.experiment.show.victims import told
 from nodes.experiment.steps import capture
-from nodes.experiment.steps.elsewhere import plan_of, plans_elsewhere
+from nodes.experiment.steps.elsewhere import plans_elsewhere
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import MeasuringReport, Point
 
@@ -138,17 +139,17 @@ def plans(
         ending: Suffix of the sources' names, which distinguishes their frames.
     """
     config = experiment.config.policy
-    if has_face(experiment):  # the learned panel, or a face on it
-        space, seen = _seen_face(experiment)
-        painted = PaintedScene(experiment, scene, _TRAINING_TEXTURE_PX)
-        dressed, seen_in_surrogate, any_colours = _Domains(painted, seen, _any_face(experiment, space))
-    else:
-        dressed, seen_in_surrogate, any_colours = _object_domains(experiment, scene, objects)
+    domains = (
+        _face_domains(experiment, scene)
+        if has_face(experiment)
+        else _object_domains(experiment, scene, objects)
+    )
+    dressed, any_colours = domains.dressed, domains.any_colours
 
     def source(domain: str, name: str) -> FrameSource:
         called, drawn = f"{domain}-{name}{ending}", sample or any_colours
         if domain == "surrogate":
-            return RenderedSource(called, seen_in_surrogate, experiment.dynamics, drawn)
+            return RenderedSource(called, domains.seen_in_surrogate, experiment.dynamics, drawn)
         if config.own_car:
             speed_mps, dt_s = experiment.car.speed_mps, experiment.config.dt_s
             return SceneSource(called, scene, experiment.view, speed_mps, dt_s, dressed.paint, drawn)
@@ -156,16 +157,24 @@ def plans(
 
     found = []
     for name in experiment.config.paths:
+        common: dict[str, Any] = {
+            "drive_steps": config.drive_steps,
+            "goal": experiment.goal(name),
+            "expert": experiment.expert(name),
+            "driven_m": config.driven_m,
+            "drives_from_m": config.drives_from_m,
+        }
         amounts = (
             ("deployed", config.deployed_stills, config.deployed_drives),
             ("surrogate", config.surrogate_stills, config.surrogate_drives),
         )
         for domain, stills, drives in amounts:
-            found.append(plan_of(experiment, name, source(domain, name), stills, drives))
+            found.append(SourcePlan(source(domain, name), stills, drives, **common))
     return found
 
 
-class _Domains(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Domains:
     """Sources of frames: the attacked deployment scene, and the surrogate with the objects plain (None) or in any colours."""
 
     dressed: Dressed
@@ -212,6 +221,13 @@ def surrogate_plan(experiment: Experiment) -> SourcePlan:
     source = RenderedSource("surrogate", seen, experiment.dynamics, _any_face(experiment, space))
     wanted = experiment.config.policy
     return SourcePlan(source, wanted.surrogate_stills, wanted.surrogate_drives, wanted.drive_steps)
+
+
+def _face_domains(experiment: Experiment, scene: World) -> _Domains:
+    """Domains with the learned panel, or with a face on it."""
+    space, seen = _seen_face(experiment)
+    dressed = PaintedScene(experiment, scene, _TRAINING_TEXTURE_PX)
+    return _Domains(dressed, seen, _any_face(experiment, space))
 
 
 def _any_face(experiment: Experiment, space: FaceSpace) -> Sample:

@@ -11,7 +11,6 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from advnerf_core.documents import read_json
 from advnerf_core.driving.metrics import no_effect_m
 from advnerf_core.files import write_json
 from advnerf_core.learning.frames import Frames, FrameStore
-from advnerf_core.learning.recipe import labelled, near, recovery_states
+from advnerf_core.learning.recipe import SourcePlan, labelled, near, recovery_states
 from advnerf_core.learning.retrain import FineTuneConfig, fine_tune
 from advnerf_core.learning.sources import steer_with
 from advnerf_core.policies.policy_file import LoadedPolicy, load_policy
@@ -36,7 +35,8 @@ from nodes.experiment.engine.artefact import hash_of
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import Dressed, deployed_drives
+from nodes.experiment.show.deployed import Dressed
+from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.given import victim_spec
 from nodes.experiment.show.native import stand_in
 from nodes.experiment.show.objects import placed_objects
@@ -77,8 +77,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     require_same_steering(experiment)
     space = colour_space(experiment)
     main = experiment.config.main_victim
-    store = FrameStore(experiment.stage_folder(experiment.config.policy_stage(RETRAINED)) / "frames")
-    file, rounds, kept = Path(victim_spec(experiment, main)), [], [store.load(name) for name in store.names()]
+    file, rounds, kept = Path(victim_spec(experiment, main)), [], _old_frames(experiment)
     victim = load_policy(file)
     thetas: list[torch.Tensor] = []
     pays_m = pays_from_m(experiment)
@@ -125,7 +124,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
                     new,
                     settings,
                     file,
-                    partial(_stepped, told, wanted.steps, experiment.car.control_unit),
+                    _stepping(told, wanted.steps, experiment.car.control_unit),
                 )
             victim, kept = load_policy(file), [*kept, *new]
 
@@ -152,8 +151,17 @@ def _part(report: Report, begin: float, share: float, name: str) -> Told:
     return told
 
 
-def _stepped(told: Told, steps: int, unit: str, step: int, loss: float) -> None:
-    told(0.7 + 0.3 * step / steps, f"fine-tuning: error {loss**0.5:.3f} {unit}")
+def _stepping(told: Told, steps: int, unit: str) -> Callable[[int, float], None]:
+    def stepped(step: int, loss: float) -> None:
+        told(0.7 + 0.3 * step / steps, f"fine-tuning: error {loss**0.5:.3f} {unit}")
+
+    return stepped
+
+
+def _old_frames(experiment: Experiment) -> list[Frames]:
+    trained_in = experiment.config.policy_stage(RETRAINED)
+    store = FrameStore(experiment.stage_folder(trained_in) / "frames")
+    return [store.load(name) for name in store.names()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +267,7 @@ def _collect(
 
     If requested also stills with all objects in random colours at random places.
     """
-    wanted, store, width = experiment.config.retrain, FrameStore(folder / "frames"), experiment.across_m(1.0)
+    wanted, store = experiment.config.retrain, FrameStore(folder / "frames")
     assert wanted is not None
     learns = replace(experiment, config=experiment.config.training(RETRAINED))
     found = plans(learns, scene, lambda rng: thetas[int(rng.integers(len(thetas)))])
@@ -271,19 +279,34 @@ def _collect(
     for number, (plan, stills, drives) in enumerate(chosen):
         if plan.source.name not in store.names():
             rng = np.random.default_rng([wanted.seed, len(thetas), number])
-            expert, driven_m, size = plan.expert, plan.driven_m, plan.source.batch_size
-            assert expert is not None, "every plan of a world has its own teacher"
-            places_m = recovery_states(expert.path, stills, rng, width * _NEAR_M, _TURNED_RAD, driven_m)
-            parts = [plan.source.look(places_m[at : at + size], rng) for at in range(0, stills, size)]
-            # Early on the path: the following part is driven through.
-            begin_m = None if driven_m is None else 0.3 * driven_m
-            near_m, turned_rad = 0.5 * width * _NEAR_M, 0.5 * _TURNED_RAD
-            starts = recovery_states(expert.path, 2 * drives, rng, near_m, turned_rad, begin_m)
-            steer = steer_with(victim.policy, torch.tensor([plan.goal]))
-            keep = near(expert.path, width * _GIVE_UP_M)
-            # Two side by side, so that one of them meets an attacked texture throughout.
-            for at in range(0, 2 * drives, 2):
-                parts.append(plan.source.drive(steer, starts[at : at + 2], wanted.drive_steps, keep, rng))
-            store.append(plan.source.name, labelled(parts, expert, plan.goal))
+            frames = _frames(plan, victim, stills, drives, wanted.drive_steps, rng, experiment.across_m(1.0))
+            store.append(plan.source.name, frames)
         report(0.4 + 0.3 * (number + 1) / len(chosen), f"collecting: {plan.source.name}")
     return [store.load(plan.source.name) for plan, _, _ in chosen]
+
+
+def _frames(
+    plan: SourcePlan,
+    victim: LoadedPolicy,
+    stills: int,
+    drives: int,
+    steps: int,
+    rng: np.random.Generator,
+    width: float,
+) -> Frames:
+    """Frames of one plan; lateral distances are ``width`` times the junction's."""
+    expert, near_m = plan.expert, width * _NEAR_M
+    assert expert is not None, "every plan of a world has its own teacher"
+    places = recovery_states(expert.path, stills, rng, near_m, _TURNED_RAD, plan.driven_m)
+    size = plan.source.batch_size
+    parts = [plan.source.look(places[first : first + size], rng) for first in range(0, stills, size)]
+    # Early on the path: the following part is driven through.
+    begin_m = None if plan.driven_m is None else 0.3 * plan.driven_m
+    starts = recovery_states(expert.path, 2 * drives, rng, 0.5 * near_m, 0.5 * _TURNED_RAD, begin_m)
+    steer = steer_with(victim.policy, torch.tensor([plan.goal]))
+
+    keep = near(expert.path, width * _GIVE_UP_M)
+    # Two side by side, so that one of them meets an attacked texture throughout.
+    for first in range(0, 2 * drives, 2):
+        parts.append(plan.source.drive(steer, starts[first : first + 2], steps, keep, rng))
+    return labelled(parts, expert, plan.goal)

@@ -8,7 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from advnerf_core.report.conditions import LIGHT, LINE_STYLES
+from advnerf_core.report.palette import LIGHT, LINE_STYLES
 from advnerf_core.report.plots import new_axes, write_png
 
 _COLOURS = {"straight": "#3465a4", "right": "#b0123c", "left": "#dd9300"}

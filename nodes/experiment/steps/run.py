@@ -20,8 +20,9 @@ from nodes.experiment.plan.object_kinds import PANEL
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.plan.victims import RETRAINED
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.experiment_world import NotCapturedError, WorldUnknownError, is_users, keep_worlds
+from nodes.experiment.show.experiment_world import NotCapturedError
 from nodes.experiment.show.given import VictimUnknownError, given_in, victim_spec
+from nodes.experiment.show.kept_worlds import WorldUnknownError, is_users, keep_worlds
 from nodes.experiment.show.victims import look_at_given
 from nodes.experiment.steps.keys import without_solids
 from nodes.experiment.steps.live import check_live
@@ -73,21 +74,29 @@ def _load(experiment: Experiment, document: Document) -> Experiment:
 def _check_world(experiment: Experiment, document: Document) -> None:
     """Raise for values that do not fit the world, with the line of the file."""
     read_world(document.part(("world",)), experiment.file.parent)
-    # A control tick is a whole number of the world's steps.
+    _check_ticks(experiment, document)
+    _check_objective(experiment, document)
+    _check_native(experiment, document)
+    if experiment.config.deploy.live:
+        check_live(experiment, document.place(("deploy",)))
+    if experiment.is_described:
+        _check_places(experiment, document)
+
+
+def _check_ticks(experiment: Experiment, document: Document) -> None:
+    """Check that a control tick is a whole number of the world's steps."""
     step_s, dt_s = experiment.traits.step_s, experiment.config.dt_s
     if step_s is not None and abs(round(dt_s / step_s) * step_s - dt_s) > _WHOLE_STEP_S:
         raise ConfigError(
             f"{document.place(('dt_s',))}: expected dt_s to be whole steps of the world {experiment.named_world.kind}, {step_s:g} s each, "
             f"got {dt_s:g} s"
         )
-    # Users' objectives are checked before any stage.
+
+
+def _check_objective(experiment: Experiment, document: Document) -> None:
+    """Check that the objective collision has a world with obstacles; users' objectives are checked before any stage."""
     if experiment.config.attack.objective == "collision" and experiment.solids is None:
         raise ConfigError(f"{document.place(('attack', 'objective'))}: {without_solids(experiment)}")
-    _check_native(experiment, document)
-    if experiment.config.deploy.live:
-        check_live(experiment, document.place(("deploy",)))
-    if experiment.is_described:
-        _check_places(experiment, document)
 
 
 def _check_native(experiment: Experiment, document: Document) -> None:
@@ -118,13 +127,7 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         if name not in experiment.world.paths:
             message = unknown(name, "path", experiment.world.paths)
             raise ConfigError(f"{document.place(('paths', index))}: paths: {message}")
-    # But for one in twenty, drawn starts are on the track.
-    sigma, limit_m = experiment.config.attack.start_sigma, experiment.world.off_track_m
-    if sigma > 0.5 * limit_m:
-        raise ConfigError(
-            f"{document.place(('attack', 'start_sigma'))}: expected attack.start_sigma to be at most half of the off-track limit, "
-            f"{limit_m:g} m, got {sigma:g}; with more, drives begin off the track"
-        )
+    _check_start_sigma(experiment, document)
     _check_start_poses(experiment, document)
     if experiment.config.own_scene or isinstance(experiment.named_world.make(), Photographed):
         _check_undriven(experiment, document)
@@ -135,16 +138,7 @@ def _check_places(experiment: Experiment, document: Document) -> None:
     if not experiment.config.own_scene and (found := in_a_lane(experiment.placed_by_hand, experiment.world)):
         raise ConfigError(f"{document.place(('objects', by_hand[found[0]]))}: {found[1]}")
     if isinstance(carrier := experiment.config.carrier, FaceCarrier):
-        panels = experiment.world.panels
-        if carrier.panel not in panels:
-            message = unknown(carrier.panel, "panel", panels)
-            raise ConfigError(f"{document.place(('carrier', 'panel'))}: carrier.panel: {message}")
-        has_screen = panels[carrier.panel].screen_px is not None
-        if has_screen != isinstance(carrier, ScreenConfig):
-            raise ConfigError(
-                f"{document.place(('carrier', 'kind'))}: expected carrier.kind {'screen' if has_screen else 'overlay'} with the panel "
-                f"{carrier.panel}, which is {'a' if has_screen else 'no'} screen, got {carrier.kind}"
-            )
+        _check_panel(carrier, experiment, document)
     if experiment.traits.own_photo_colours and not experiment.config.capture.colour_pairs:
         raise ConfigError(
             f"{document.place(('capture',))}: expected capture.colour_pairs of at least 1, as the photographs of the world "
@@ -152,6 +146,16 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         )
     if not given_in(experiment.config):  # existing policies are checked when the experiment is run
         _ = experiment.view
+
+
+def _check_start_sigma(experiment: Experiment, document: Document) -> None:
+    """Check that drawn starts are on the track, but for one in twenty."""
+    sigma, limit_m = experiment.config.attack.start_sigma, experiment.world.off_track_m
+    if sigma > 0.5 * limit_m:
+        raise ConfigError(
+            f"{document.place(('attack', 'start_sigma'))}: expected attack.start_sigma to be at most half of the off-track limit, "
+            f"{limit_m:g} m, got {sigma:g}; with more, drives begin off the track"
+        )
 
 
 def _check_start_poses(experiment: Experiment, document: Document) -> None:
@@ -165,6 +169,20 @@ def _check_start_poses(experiment: Experiment, document: Document) -> None:
                     f"{document.place(('attack', 'start_poses', index))}: expected attack.start_poses on the track, at most {limit_m:g} m from the "
                     f"middle of the path {name}, got x = {x_m:g} m, y = {y_m:g} m, which is {abs(cte_m):.2f} m from it; give them in metres, as the path"
                 )
+
+
+def _check_panel(carrier: FaceCarrier, experiment: Experiment, document: Document) -> None:
+    """Check that the panel of a face exists in the world, and is a screen exactly if a screen shows the face."""
+    panels = experiment.world.panels
+    if carrier.panel not in panels:
+        message = unknown(carrier.panel, "panel", panels)
+        raise ConfigError(f"{document.place(('carrier', 'panel'))}: carrier.panel: {message}")
+    has_screen = panels[carrier.panel].screen_px is not None
+    if has_screen != isinstance(carrier, ScreenConfig):
+        raise ConfigError(
+            f"{document.place(('carrier', 'kind'))}: expected carrier.kind {'screen' if has_screen else 'overlay'} with the panel "
+            f"{carrier.panel}, which is {'a' if has_screen else 'no'} screen, got {carrier.kind}"
+        )
 
 
 def _check_undriven(experiment: Experiment, document: Document) -> None:

@@ -5,14 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from advnerf_core.data.views import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
-from advnerf_core.scene.colour import fit_colour_map
+from advnerf_core.scene.colour import ColourMap, fit_colour_map
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.render_field import FieldRenderer
-from advnerf_core.scene.train import TrainConfig, TrainingReport, train_scene
+from advnerf_core.scene.train import TrainConfig, TrainedScene, TrainingReport, train_scene
 from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.learned_scene import captured, compare_views, scene_file
 from nodes.experiment.steps import capture
@@ -54,15 +57,23 @@ def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
     }
     if experiment.config.capture.colour_pairs:
         report(_TRAINING_SHARE, "fitting the colour map")
-        # To the driving camera's colours, fitted to views of the same places.
-        pairs = captured(experiment, capture.COLOUR_PAIRS).load()
-        bare = FieldRenderer(trained.scene, trained.occupied, trained.march)
-        seen = zip(pairs.T_world_from_camera, pairs.pinholes, strict=True)
-        learned = torch.cat([bare.render(pose[None], pinhole)[0] for pose, pinhole in seen]).numpy()
-        metadata["colour_map"] = fit_colour_map(learned, pairs.rgb).to_dict()
+        metadata["colour_map"] = _colour_map(experiment, trained).to_dict()
     save_scene(scene_file(experiment), trained.scene, trained.occupied, metadata)
     compare_views(experiment, _TRAINING_SHARE, report)
     checkpoint.unlink(missing_ok=True)
+
+
+def _colour_map(experiment: Experiment, trained: TrainedScene) -> ColourMap:
+    """Map from the photographs' colours to the driving camera's, fitted to views of the same places."""
+    pairs = captured(experiment, capture.COLOUR_PAIRS).load()
+    bare = FieldRenderer(trained.scene, trained.occupied, trained.march)
+    return fit_colour_map(render_like(bare, pairs), pairs.rgb)
+
+
+def render_like(renderer: FieldRenderer, views: ImageSet) -> NDArray[np.float32]:
+    """Render every view of an image set at its own pose and size, ``[N, H, W, 3]`` in 0..1."""
+    pairs = zip(views.T_world_from_camera, views.pinholes, strict=True)
+    return torch.cat([renderer.render(pose[None], pinhole)[0] for pose, pinhole in pairs]).numpy()
 
 
 def field_config(experiment: Experiment) -> SceneFieldConfig:

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.report import plots
-from advnerf_core.report.conditions import CONDITIONS, DARK, LIGHT, SPARE, know_methods, order_of, style_of
+from advnerf_core.report.conditions import CONDITIONS, SPARE, know_methods, order_of, style_of
 from advnerf_core.report.data import LossCurve, Maximised, ReportData
+from advnerf_core.report.palette import DARK, LIGHT
 from advnerf_core.report.sections import page_sections
 
 ROOT = Path(__file__).parents[3]

@@ -13,11 +13,9 @@ from scipy import optimize, stats
 from advnerf_core.report.evidence.intervals import (
     MEASURED_COVERAGE,
     clustered_interval,
-    crossed,
-    difference,
     difference_interval,
-    one_sample,
 )
+from advnerf_core.report.evidence.mean_estimate import crossed, difference, one_sample
 from benchmarks.coverage import p_above, p_below
 from benchmarks.results import read_rows
 

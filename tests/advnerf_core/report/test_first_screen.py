@@ -12,7 +12,7 @@ from advnerf_core.report.sections import page_sections
 from nodes.audit.judging import FOUND, NO_OBJECT, PLAIN_OBJECT
 from nodes.audit.page import write_page
 from nodes.audit.verdict import ArmDrives
-from nodes.experiment.pages.table import Wording, first_screen
+from nodes.experiment.pages.opening import Wording, first_screen
 from tests.support.audits import audit_result
 from tests.support.live.page_browser import PHONE, available
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from advnerf_core.files import write_json
 from advnerf_core.report.cells import cell_from
 from advnerf_core.report.evidence.hardness import (
     HARDENED,
@@ -20,6 +19,7 @@ from advnerf_core.report.evidence.hardness import (
     read_hardness,
     victim_title,
     with_titles,
+    write_hardness,
 )
 
 POLICY = "a" * 64
@@ -125,7 +125,7 @@ def test_titles_are_read_from_the_folder_of_a_set(tmp_path):
         json.dumps(cell(passed.digest).model_dump(mode="json", exclude_unset=True))
     )
     assert with_titles(tmp_path, data)["rows"] == [{"victim": TRAINED_WITH_TEXTURES}]
-    write_json(tmp_path / PUBLISHED_FILE, HardnessRecord(verdicts=(passed,)).model_dump(mode="json"))
+    write_hardness(tmp_path / PUBLISHED_FILE, HardnessRecord(verdicts=(passed,)))
     assert read_hardness(tmp_path / PUBLISHED_FILE).passing(POLICY) == passed
     found = with_titles(tmp_path, data)
     assert {

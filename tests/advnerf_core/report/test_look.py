@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from advnerf_core.report.conditions import PAGE_DARK, PAGE_LIGHT, look_css
+from advnerf_core.report.palette import PAGE_DARK, PAGE_LIGHT, look_css
 
 ROOT = Path(__file__).parents[3]
 SHEETS = (

@@ -8,8 +8,9 @@ from matplotlib.colors import to_rgb
 
 from advnerf_core.geometry import make_transform, rotation_z
 from advnerf_core.report import maps, plots
-from advnerf_core.report.conditions import CONDITIONS, DARK, LIGHT
+from advnerf_core.report.conditions import CONDITIONS
 from advnerf_core.report.data import face_segment
+from advnerf_core.report.palette import DARK, LIGHT
 
 # Machado, Oliveira and Fernandes 2009: dichromacy (severity 1) on linear RGB.
 DICHROMATS = {

@@ -10,7 +10,7 @@ from advnerf_core.report.data import Texture
 from advnerf_core.report.result_page import render_page
 from advnerf_core.report.result_table import ResultTable, make_table
 from advnerf_core.report.sections import page_sections
-from nodes.experiment.pages.table import Wording, first_screen, summaries
+from nodes.experiment.pages.opening import Wording, first_screen, summaries
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 

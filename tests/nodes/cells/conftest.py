@@ -13,6 +13,7 @@ import pytest
 from nodes.experiment.run import (
     admission,
     gate,
+    maps,
     plan,
     predictions,
     published,
@@ -21,7 +22,7 @@ from nodes.experiment.run import (
 )
 from tests.support import toy_cells, toy_pictures
 
-MODULES = (admission, gate, plan, predictions, published, run, worker)
+MODULES = (admission, gate, maps, plan, predictions, published, run, worker)
 
 
 @pytest.fixture

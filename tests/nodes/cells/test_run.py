@@ -9,7 +9,8 @@ import time
 
 import pytest
 
-from nodes.experiment.run.plan import map_cells, statuses
+from nodes.experiment.run.maps import map_cells
+from nodes.experiment.run.plan import statuses
 from nodes.experiment.run.run import Options, _shares, run_cells
 from nodes.experiment.run.store import Store
 from nodes.experiment.run.worker import take_cell

@@ -11,7 +11,8 @@ from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import run_cell, search_cell
 from nodes.experiment.run.gate import lacks, predict_cell
 from nodes.experiment.show.context import Experiment
-from nodes.experiment.show.deployed import DressedScene, deployed_drives
+from nodes.experiment.show.deployed import DressedScene
+from nodes.experiment.show.drives import deployed_drives
 from nodes.experiment.show.objects import placed_objects
 from nodes.experiment.steps import fidelity
 from nodes.experiment.steps.keys import clean_folder

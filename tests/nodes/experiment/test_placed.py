@@ -13,10 +13,10 @@ from advnerf_core.objects.voxel.generators import GENERATORS, hydrant, small_car
 from advnerf_core.objects.voxel.rasterise import draw_mesh
 from hardware.worlds.junction.config import IntersectionConfig
 from hardware.worlds.junction.scene import Intersection
-from nodes.experiment.pages.report import from_above
 from nodes.experiment.plan.object_kinds import MADE_HERE_M
 from nodes.experiment.plan.placed import PlacedObject, in_a_lane
 from nodes.experiment.show.context import Experiment
+from nodes.experiment.show.overview import from_above
 from nodes.experiment.steps.run import load_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"

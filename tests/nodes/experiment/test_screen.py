@@ -15,7 +15,7 @@ from calibration.display_colour import DisplayCalibration
 from calibration.schema import BY_CONSTRUCTION, CalibrationError, save_calibration
 from hardware.worlds.lab.config import MonitorOpticsConfig
 from hardware.worlds.lab.world import MONITOR_PIXELS
-from nodes.experiment.show import faces
+from nodes.experiment.show import faces, screen
 from nodes.experiment.steps.run import load_experiment
 from tests.support.faces import centre_square
 
@@ -120,7 +120,7 @@ def test_the_measured_colours_are_those_of_the_optics(experiment):
     optics = experiment.named_world.config.monitor_optics
     assert optics == MonitorOpticsConfig.office()
     with experiment.open_world() as world:
-        fit = faces.measure_display(world, "monitor", faces.panel_of(experiment))
+        fit = screen.measure_display(world, "monitor", faces.panel_of(experiment))
     assert fit.rmse(True) < 0.02
     assert fit.model.falloff == pytest.approx(optics.falloff, abs=0.3)
     shown = np.random.default_rng(0).random((50, 3))

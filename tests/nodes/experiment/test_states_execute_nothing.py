@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from nodes.cli.main import app
 from nodes.experiment.plan.cell import Cell
 from nodes.experiment.run.cells import runs_alone
-from nodes.experiment.show.experiment_world import keep_worlds
+from nodes.experiment.show.kept_worlds import keep_worlds
 from nodes.experiment.steps.keys import settings_hash
 from nodes.experiment.steps.pipeline import stages_of
 from nodes.experiment.steps.run import load_experiment

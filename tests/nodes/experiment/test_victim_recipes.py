@@ -9,11 +9,11 @@ import torch
 from advnerf_core.documents import read_json
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.policies.policy_file import load_policy
-from benchmarks.run_folders import experiment_in
 from nodes.experiment.plan.config import ExperimentConfig
 from nodes.experiment.run.plan import statuses
 from nodes.experiment.run.published import table_of
 from nodes.experiment.run.run import Options, run_cells
+from nodes.experiment.show.context import Experiment
 from nodes.experiment.show.given import victim_sha256
 from nodes.experiment.show.objects import random_textures
 from nodes.experiment.show.victims import load_victim
@@ -101,7 +101,7 @@ def test_every_victim_is_trained_by_its_recipe_attacked_and_in_the_table(tiny_ro
     assert [list(each) for each in stages.values()] == [
         ["capture", "scene", stage, "object"] for stage in ("policy", *own)
     ]
-    assert experiment_in(tmp_path / "run").config.trained == experiment.config.trained
+    assert Experiment.resolved_in(tmp_path / "run").config.trained == experiment.config.trained
 
 
 def test_a_recipe_changes_its_own_victim_alone(tiny_room):

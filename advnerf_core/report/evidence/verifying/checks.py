@@ -31,16 +31,9 @@ def set_problems(folder: Path, evidence: Evidence, under_way: bool = False) -> I
     damaged, withdrawn = under_way, read_withdrawn(folder)
     missing = [] if under_way else missing_cells(evidence, withdrawn)
     absent = (f"{name}: was registered, and is not there" for name in missing)
-    # Of two files of one cell, only one would count.
-    files = zip(cell_files(folder), evidence.all_cells, strict=True)
-    misnamed = (
-        f"{file}: expected the cell of this name, got {cell.name}; restore both from git, or remove the copy"
-        for file, cell in files
-        if file.stem != cell.name
-    )
     for check in (
         absent,
-        misnamed,
+        _name_problems(folder, evidence),
         cell_problems(evidence, withdrawn),
         drive_problems(evidence),
     ):
@@ -48,15 +41,26 @@ def set_problems(folder: Path, evidence: Evidence, under_way: bool = False) -> I
             damaged = True
             yield problem
     yield from build_problems(evidence)
-    # Each search has its own attack, possibly driven under several conditions.
-    attacked = [cell for cell in evidence.cells.values() if cell.method not in CONTROLS]
-    yield from _attacks(attacked)
-    yield from _copies(attacked)
-    yield from _shared_searches(evidence, attacked)
+    yield from _search_problems(evidence)
     yield from _prediction_problems(folder, evidence)
     yield from _gate_problems(folder, evidence)
     if not damaged:
         yield from declaration_problems(evidence, read_declared(folder))
+
+
+def _name_problems(folder: Path, evidence: Evidence) -> Iterator[str]:
+    """Whether each file is of the cell that it is named after: of two files of one cell, only one would count."""
+    for file, cell in zip(cell_files(folder), evidence.all_cells, strict=True):
+        if file.stem != cell.name:
+            yield f"{file}: expected the cell of this name, got {cell.name}; restore both from git, or remove the copy"
+
+
+def _search_problems(evidence: Evidence) -> Iterator[str]:
+    """Whether each search has its own attack, possibly driven under several conditions."""
+    attacked = [cell for cell in evidence.cells.values() if cell.method not in CONTROLS]
+    yield from _attacks(attacked)
+    yield from _copies(attacked)
+    yield from _shared_searches(evidence, attacked)
 
 
 def _attacks(attacked: list[CellResult]) -> Iterator[str]:

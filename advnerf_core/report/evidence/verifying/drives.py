@@ -69,11 +69,7 @@ def _in_domain(
         clean = evidence.without(cell)
         if clean is not None and clean.kept.get(domain):
             key = (clean.name, domain)
-            if key not in able:  # medians, so that one bad drive does not excuse the others
-                longest_m = float(np.median([_moved(drive, 0.0).step_m for drive in clean.kept[domain]]))
-                slips = [_moved(drive, longest_m).slip_rad for drive in clean.kept[domain]]
-                slip_rad = max(_LEAST_SLIP_RAD[domain], _SLIP_RATIO * float(np.median(slips)))
-                able[key] = Motion(longest_m, slip_rad)
+            able[key] = able.get(key) or _able(clean, domain)
             yield from _motion(cell, domain, able[key], where)
         yield from _totals(evidence, cell, domain, where)
     except ValueError as error:
@@ -103,6 +99,13 @@ def _motion(cell: CellResult, domain: Domain, able: Motion, where: str) -> Itera
             yield f"{where}, start {number}: a step of {found.step_m:.3f} m, and without attack the car drives {able.step_m:.3f} m in a tick"
         elif found.slip_rad > able.slip_rad:
             yield f"{where}, start {number}: moves {found.slip_rad:.3f} rad off its heading, and the car slips {able.slip_rad:.3f} rad at most"
+
+
+def _able(clean: CellResult, domain: Domain) -> Motion:
+    """The car's motion without attack: the median over drives, so that one bad drive does not excuse the others."""
+    longest_m = float(np.median([_moved(drive, 0.0).step_m for drive in clean.kept[domain]]))
+    slip_rad = float(np.median([_moved(drive, longest_m).slip_rad for drive in clean.kept[domain]]))
+    return Motion(longest_m, max(_LEAST_SLIP_RAD[domain], _SLIP_RATIO * slip_rad))
 
 
 def _moved(drive: KeptDrive, longest_m: float) -> Motion:

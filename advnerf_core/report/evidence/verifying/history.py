@@ -8,20 +8,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
-
-from pydantic import Field, ValidationError, model_validator
+from typing import Any
 
 from advnerf_core.documents import parse_json, read_json
 from advnerf_core.report.evidence.kept_build import BUILD
-from advnerf_core.report.evidence.registration import FILE, SetError
+from advnerf_core.report.evidence.registration import FILE
 from advnerf_core.report.evidence.verifying.git import Change, History, NoHistory, blob_of
 from advnerf_core.report.evidence.verifying.layout import SET, cell_files, sets_in
-from advnerf_core.strict import StrictModel
+from advnerf_core.report.evidence.verifying.removed import LOG, read_removed, value_entry
 
 LEDGER = "../results.json"
-# The log of published results that were removed or rewritten, each with the reason.
-LOG = "removed.json"
 # Keys that identify one measurement of a row.
 _MEASUREMENT = ("date", "machine", "command", "note", "unit")
 Log = Mapping[tuple[str, str], str]
@@ -109,15 +105,7 @@ def _since_added(changes: list[Change]) -> list[Change]:
 
 def _gone(history: History, published: Path, log: Log) -> Iterator[str]:
     """Sets, their files and registered scenarios that were committed once and are now missing without a log entry."""
-    # What belongs to a set and is not generated from its other files.
-    once = [
-        name
-        for name in history.below()
-        if "/" in name
-        and name.endswith(".json")
-        and not name.startswith(f"{BUILD}/")
-        and not name.endswith(f"/{SET}")
-    ]
+    once = [name for name in history.below() if _is_kept(name)]
     for kind, names in (
         ("set", {name.split("/")[0] for name in once if not (published / name.split("/")[0]).is_dir()}),
         ("file", {name for name in once if not (published / name).exists()}),
@@ -127,6 +115,16 @@ def _gone(history: History, published: Path, log: Log) -> Iterator[str]:
             gone_with_its_set = kind != "set" and not (published / name.split("/")[0]).is_dir()
             if (kind, name) not in log and not gone_with_its_set:
                 yield f"{published}: the {kind} {name} was committed once, is not there, and {LOG} does not say why"
+
+
+def _is_kept(name: str) -> bool:
+    """Whether a published file belongs to a set and is not generated from its other files."""
+    return (
+        "/" in name
+        and name.endswith(".json")
+        and not name.startswith(f"{BUILD}/")
+        and not name.endswith(f"/{SET}")
+    )
 
 
 def _scenarios_once(history: History) -> set[str]:
@@ -198,62 +196,3 @@ def _ledger(text: bytes) -> list[dict[str, Any]]:
         return [row for row in parse_json(text, LEDGER) if row.keys() >= {"line", "value", "met", "target"}]
     except (ValueError, KeyError, TypeError, AttributeError):  # a ledger that was damaged once
         return []
-
-
-class Removed(StrictModel):
-    """Results that were removed or rewritten for one reason.
-
-    Attributes:
-        kind: Kind of the entries: removed rows of the ledger, values of rows that replaced others of one measurement, registered
-            scenarios (``SET/SCENARIO``), files (by path), sets, or registrations that were rewritten before anything of their sets
-            was run (``SET``).
-        names: Name of each entry.
-        reason: Why.
-        stands: For ``value``, the new value of each row; a later one is not covered.
-        commit: The commit, if its number is known; for readers.
-    """
-
-    kind: Literal["row", "value", "scenario", "file", "set", "registration"]
-    names: tuple[str, ...] = Field(min_length=1)
-    reason: str = Field(min_length=10)
-    stands: dict[str, float | str] = Field(default_factory=dict)
-    commit: str = ""
-
-    @model_validator(mode="after")
-    def _stands_for_values(self) -> Removed:
-        if self.stands.keys() != (set(self.names) if self.kind == "value" else set()):
-            raise ValueError(
-                "expected stands to hold the value of each row of kind value, and of nothing else"
-            )
-        return self
-
-    def entries(self) -> Iterator[tuple[str, str]]:
-        """Kind and name of each entry, as checks look them up; a value with its row (`value_entry`)."""
-        if self.kind == "value":
-            yield from (value_entry(line, value) for line, value in self.stands.items())
-        else:
-            yield from ((self.kind, name) for name in self.names)
-
-
-def value_entry(line: str, value: float | str) -> tuple[str, str]:
-    """Log key of a row's value that replaced another one of the same measurement."""
-    return "value", f"{line}: {value}"
-
-
-def read_removed(published: Path) -> dict[tuple[str, str], str]:
-    """The reason of each logged removal, by kind and name; empty without a log.
-
-    Raises:
-        SetError: The file is not such a log.
-    """
-    file = published / LOG
-    if not file.exists():
-        return {}
-    try:
-        found = [Removed.model_validate(each) for each in read_json(file)]
-    except (OSError, ValueError, TypeError, ValidationError) as error:
-        text = error.errors(include_url=False)[0]["msg"] if isinstance(error, ValidationError) else str(error)
-        raise SetError(
-            f"{file}: expected a list of removals with their reasons, got: {text}; restore it from git"
-        ) from None
-    return {entry: each.reason for each in found for entry in each.entries()}

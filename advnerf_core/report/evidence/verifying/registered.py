@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from datetime import datetime
+from typing import Any
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import CONTROLS
-from advnerf_core.report.evidence.registration import settings_differences
+from advnerf_core.report.evidence.registration import RegisteredScenario, settings_differences
 from advnerf_core.report.evidence.results import Evidence
 
 
@@ -56,12 +57,7 @@ def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
             yield f"{cell.name}: expected {key} {value} as registered, got {found}"
     if bool(scenario.settings) > bool(cell.settings):
         yield f"{cell.name}: expected its settings, as the registration has them, got none"
-    registered = {**scenario.settings, **scenario.pinned(cell.victim, cell.method)}
-    # A victim with a recipe of its own has its own training and architecture.
-    if (recipe := scenario.settings.get("recipes", {}).get(cell.victim)) is not None:
-        policy = {name: recipe[name] for name in scenario.settings["policy"]}
-        architecture = {name: value for name, value in recipe.items() if name not in policy}
-        registered |= {"policy": policy, "architecture": architecture}
+    registered = {**_settings_of(scenario, cell.victim), **scenario.pinned(cell.victim, cell.method)}
     # Its policy is the one that drove, also in cells from before their settings were stored.
     for text in settings_differences(registered, {**cell.settings, "policy_sha256": cell.policy_sha256}):
         yield f"{cell.name}: expected the registered settings, got {text}"
@@ -69,12 +65,25 @@ def _as_registered(evidence: Evidence, cell: CellResult) -> Iterator[str]:
     if not clip.startswith(cell.name):
         yield f"{cell.name}: names the clip of another cell, {clip}"
     registered_on = evidence.registration.date
-    try:
-        is_older = datetime.fromisoformat(cell.date) < datetime.fromisoformat(registered_on)
-    except (ValueError, TypeError):  # no date, or one without a time zone
-        is_older = True
-    if is_older:
+    if not _not_before(cell.date, registered_on):
         yield f"{cell.name}: expected a date from {registered_on} on, when it was registered, got {cell.date}"
+
+
+def _settings_of(scenario: RegisteredScenario, victim: str) -> Mapping[str, Any]:
+    """The registered settings of a victim's cells: one with a recipe of its own has its own training and architecture."""
+    recipe = scenario.settings.get("recipes", {}).get(victim)
+    if recipe is None:
+        return scenario.settings
+    policy = {name: recipe[name] for name in scenario.settings["policy"]}
+    architecture = {name: value for name, value in recipe.items() if name not in policy}
+    return {**scenario.settings, "policy": policy, "architecture": architecture}
+
+
+def _not_before(date: str, other: str) -> bool:
+    try:
+        return datetime.fromisoformat(date) >= datetime.fromisoformat(other)
+    except (ValueError, TypeError):  # no date, or one without a time zone
+        return False
 
 
 def build_problems(evidence: Evidence) -> Iterator[str]:
