@@ -185,15 +185,13 @@ class AttackNode(Node):
         self._job = Job(self._folder / request_id, self.inbox, self._config.threads)
 
     def _cancel(self, message: Any) -> None:
-        wanted = str(message.request_id)
-        if wanted not in ("", self._request_id) or (self._job is None and not wanted):
-            running = "none is running" if self._job is None else f"{self._request_id} is running and goes on"
-            raise AdvnerfError(
-                f"expected the search {wanted} to cancel it; {running}"
-                if wanted
-                else f"nothing to cancel: {running}"
-            )
-        if self._job is not None:
+        wanted, running = str(message.request_id), self._job is not None
+        if not wanted and not running:
+            raise AdvnerfError("nothing to cancel: none is running")
+        if wanted not in ("", self._request_id):
+            other = f"{self._request_id} is running and goes on" if running else "none is running"
+            raise AdvnerfError(f"expected the search {wanted} to cancel it; {other}")
+        if running:
             self._keep("cancelled")
             self._finish("cancelled", str(message.reason))
 
@@ -212,13 +210,13 @@ class AttackNode(Node):
 
     def _resume(self) -> None:
         """Continue an interrupted search, and send again a finished file. What was changed or deleted since must not keep the node from other requests."""
+        if not (current := self._folder / _CURRENT).exists():
+            return
         try:
-            self._go_on(read_json(self._folder / _CURRENT))
-        except FileNotFoundError as error:
-            if Path(error.filename or "").name != _CURRENT:
-                self._progress = _fresh("failed", _not_taken_up(error))
+            self._go_on(read_json(current))
         except (AdvnerfError, OSError, LookupError, TypeError, ValueError) as error:
-            self._progress = _fresh("failed", _not_taken_up(error))
+            text = f"before this start; cannot go on with it: {in_one_line(error)}"
+            self._progress = _fresh("failed", text)
 
     def _go_on(self, current: dict[str, str]) -> None:
         if current["state"] == "running":
@@ -252,10 +250,6 @@ class AttackNode(Node):
                 **progress,
             ),
         )
-
-
-def _not_taken_up(error: Exception) -> str:
-    return f"before this start; cannot go on with it: {in_one_line(error)}"
 
 
 def _objective_of(attack: AttackFile) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from nodes.runtime.errors import BagError
 
 # Delays from stamp to recording differ by less between topics of one clock, also over Wi-Fi.
 _MOST_APART_S = 0.5
-# No link is faster than light: stamps this long after their recording are of another clock, if those of another topic are this far from them.
+# No message is recorded before it is stamped: beyond these, the delay of a topic and its distance from another's are those of another clock.
 _MOST_AHEAD_S, _ENOUGH_APART_S = 0.05, 0.1
 # Delays are compared in stretches of this length, in each from at least this many messages: a clock may drift, or be set in the middle.
 _STRETCH_S, _ENOUGH = 5.0, 3

@@ -212,6 +212,13 @@ def test_the_check_meets_a_good_camera_and_says_what_it_executes(generator: Path
     assert f"executes {generator}:Generator (sha256 " in printed
 
 
+def bench_of(generator: Path, before: str, after: str) -> CameraBench:
+    """The good camera with one change."""
+    assert before in GENERATOR
+    generator.write_text(GENERATOR.replace(before, after))
+    return CameraBench(parse_source(f"{{kind: {generator}:Generator, width: 6}}").camera())
+
+
 @pytest.mark.parametrize(
     ("part", "before", "after", "message"),
     [
@@ -233,11 +240,9 @@ def test_the_check_meets_a_good_camera_and_says_what_it_executes(generator: Path
 def test_the_check_finds_what_is_wrong(
     generator: Path, part: str, before: str, after: str, message: str
 ) -> None:
-    assert before in GENERATOR
-    generator.write_text(GENERATOR.replace(before, after))
-    camera = parse_source(f"{{kind: {generator}:Generator, width: 6}}").camera()
+    bench = bench_of(generator, before, after)
     with pytest.raises(NotMet, match=message):
-        CHECKS[part](CameraBench(camera))
+        CHECKS[part](bench)
 
 
 @pytest.mark.parametrize(
@@ -250,11 +255,9 @@ def test_the_check_finds_what_is_wrong(
 def test_the_check_shows_what_the_node_would_not_publish(
     generator: Path, part: str, before: str, after: str, message: str
 ) -> None:
-    assert before in GENERATOR
-    generator.write_text(GENERATOR.replace(before, after))
-    camera = parse_source(f"{{kind: {generator}:Generator, width: 6}}").camera()
+    bench = bench_of(generator, before, after)
     with pytest.raises(MetButLook, match=message):
-        CHECKS[part](CameraBench(camera))
+        CHECKS[part](bench)
 
 
 def test_the_check_of_a_camera_that_never_returns_ends(generator: Path) -> None:

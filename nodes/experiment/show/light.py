@@ -53,6 +53,11 @@ def measure_light(experiment: Experiment, world: World) -> DisplayFit:
     assert isinstance(world, NativePanels), "experiments are refused where their world takes no panels"
     (thing,) = experiment.objects
     poses = _poses(experiment, world, thing)
+    if not poses:
+        raise ConfigError(
+            f"{experiment.file}: expected the panel {thing.name} to be seen on the way along {experiment.config.paths[0]}, with {_LEAST_PX} pixels "
+            "inside its edge; it is hidden, turned away or too small: move it, or set carrier.response=identity"
+        )
     panel = Panel(thing.T_world_from_face, thing.side_m, thing.side_m)
     colours = colours_to_show(seed=experiment.config.capture.seed)
     seen: list[NDArray[np.float64]] = []
@@ -97,9 +102,8 @@ def light_remark(experiment: Experiment, world: World) -> str:
 def _brightness(experiment: Experiment, world: World, thing: PlacedObject) -> float:
     """How bright a grey panel looks in the middle of the views of it, as a share of its grey; 0 if no drive sees it large enough."""
     assert isinstance(world, NativePanels), "experiments are refused where their world takes no panels"
-    try:
-        poses = _poses(experiment, world, thing)
-    except ConfigError:
+    poses = _poses(experiment, world, thing)
+    if not poses:
         return 0.0
     pose = poses[len(poses) // 2]
     panel = Panel(thing.T_world_from_face, thing.side_m, thing.side_m)
@@ -112,20 +116,14 @@ def _brightness(experiment: Experiment, world: World, thing: PlacedObject) -> fl
 
 
 def _poses(experiment: Experiment, world: World, thing: PlacedObject) -> list[Pose]:
-    """First, middle and last of the poses with a large enough view of the panel."""
+    """First, middle and last of the poses with a large enough view of the panel; none if the drive has no such view."""
     found = [
         pose
         for pose in seen_from(experiment, world, thing, 1.0)
         if _region(experiment, thing, pose).sum() >= _LEAST_PX
     ]
-    if not found:
-        raise ConfigError(
-            f"{experiment.file}: expected the panel {thing.name} to be seen on the way along {experiment.config.paths[0]}, with {_LEAST_PX} pixels "
-            "inside its edge; it is hidden, turned away or too small: move it, or set carrier.response=identity"
-        )
-    return [
-        found[index] for index in np.linspace(0, len(found) - 1, min(_POSES, len(found))).round().astype(int)
-    ]
+    count = min(_POSES, len(found))
+    return [found[index] for index in np.linspace(0, len(found) - 1, count).round().astype(int)]
 
 
 def _region(experiment: Experiment, thing: PlacedObject, pose: Pose) -> NDArray[np.bool_]:
